@@ -1,0 +1,52 @@
+# Everything runs in .venv, which the first target that needs it makes: only Python >= 3.11, git and make are required.
+
+RECENT := import sys; sys.exit(sys.version_info < (3, 11))
+VERSION := import sys; print("is %d.%d" % sys.version_info[:2])
+
+# python3 unless it is too old and a newer one stands beside it; `make PYTHON=...` overrides.
+PYTHON ?= $(shell for python in python3 python3.11 python3.12 python3.13; do \
+	$$python -c '$(RECENT)' 2>/dev/null && echo $$python && exit; done; echo python3)
+RUN := .venv/bin/python -m
+READY := .venv/ready
+RESULTS := runs/benchmarks
+
+.PHONY: setup test lint kick view train bench clean
+
+setup: $(READY)
+
+# The stamp is touched last, so that an interrupted set-up is taken up again by the next make.
+$(READY): pyproject.toml constraints.txt
+	$(if $(shell $(PYTHON) -c '$(RECENT)' 2>/dev/null && echo recent),,$(error \
+	Python >= 3.11 is needed, PYTHON=$(PYTHON) $(shell $(PYTHON) -c '$(VERSION)' 2>/dev/null || echo cannot be run)))
+	@rm -f $@
+	@echo "Setting up .venv: a few minutes the first time"
+	@.venv/bin/python -c 'import pip; $(RECENT)' 2>/dev/null || $(PYTHON) -m venv --clear .venv
+	@$(RUN) pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[test]'
+	@touch $@
+
+test: $(READY)
+	@$(RUN) pytest tests
+
+lint: $(READY)
+	$(RUN) ruff check
+	$(RUN) mypy
+
+kick: $(READY)
+	@$(RUN) tasks.kick
+
+view: $(READY)
+	@$(RUN) tasks.kick --view
+
+train: $(READY)
+	@$(RUN) tasks.train
+
+bench: $(READY)
+	@mkdir -p $(RESULTS)
+	$(RUN) tasks.benchmarks.kick --targets 16 --seed 0 --preset balanced --dynamics larp --json $(RESULTS)/kick_larp.json
+	$(RUN) tasks.benchmarks.kick --targets 16 --seed 0 --preset balanced --dynamics mujoco --json $(RESULTS)/kick_mujoco.json
+	$(RUN) tasks.benchmarks.model --scene human_ball --sequences 256 --seed 1 --json $(RESULTS)/model_human_ball.json
+
+# Keeps runs/: results are never thrown away by a clean-up.
+clean:
+	rm -rf .venv build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,150 @@
+"""c(.): where two capsules are closest, when they meet within a step, and what a free impact would do.
+
+A ball is a capsule of length 0 and the ground a plane, so one description serves all contacts. All functions act on
+leading dimensions, are differentiable, and keep finite values and gradients for coincident, parallel and zero-length
+segments.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from larp_model.scene import Surface
+
+# The share of the constraint that is a spring; the rest follows the free motion (MuJoCo's impedance).
+IMPEDANCE = 0.99
+# Newton steps of conservative advancement; three leave less than a millimetre at 10 m/s.
+ADVANCES = 3
+
+
+class Segment(NamedTuple):
+    """Axis of a capsule: centre (*, 3) [m], half vector (*, 3) [m] from the centre to one end, radius (*,) [m]."""
+
+    centre: Array
+    half: Array
+    radius: Array
+
+
+class Closest(NamedTuple):
+    """Closest points of two capsules.
+
+    normal: unit vector (*, 3) from the first to the second. distance: (*,) [m], negative when they overlap.
+    point: (*, 3) [m] midway between the surfaces. along: (*, 2) place on each axis, -1 to 1.
+    """
+
+    normal: Array
+    distance: Array
+    point: Array
+    along: Array
+
+
+class Impact(NamedTuple):
+    """What a free impact does to the motion along the normal.
+
+    change: (*,) [m/s] of the separating velocity, against the same motion without contact. lag: (*,) [s] for which
+    that change acts on the position: it moves the bodies apart by change times lag. gap: (*,) [m] at the end.
+    """
+
+    change: Array
+    lag: Array
+    gap: Array
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return jnp.sum(a * b, axis=-1)
+
+
+def norm(vector: Array) -> Array:
+    """Length (*,) of vectors (*, n), with gradient zero at zero."""
+    squared = _dot(vector, vector)
+    zero = squared < 1e-20
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
+
+
+def normalise(vector: Array, otherwise: Array) -> Array:
+    """Unit vectors (*, 3); `otherwise` (3,) where the vector is zero."""
+    squared = _dot(vector, vector)[..., None]
+    zero = squared < 1e-20
+    return jnp.where(zero, otherwise, vector * jnp.where(zero, 1.0, squared) ** -0.5)
+
+
+def closest(first: Segment, second: Segment) -> Closest:
+    """Closest points of two capsules (C. Ericson, Real-Time Collision Detection, 5.1.9).
+
+    Where axes are parallel the middle of their overlap is taken; where they cross or coincide, the normal is z.
+    """
+    between = first.centre - second.centre
+    aa, bb = _dot(first.half, first.half), _dot(second.half, second.half)
+    ab, ac, bc = _dot(first.half, second.half), _dot(first.half, between), _dot(second.half, between)
+    tiny = 1e-12
+    aa, bb = aa + tiny, bb + tiny
+    determinant = aa * bb - ab * ab
+    parallel = determinant < 1e-6 * aa * bb
+    # On parallel axes every place of the overlap is closest: take its middle, projected on the first axis.
+    reach = jnp.abs(ab) / aa
+    low = jnp.maximum(-1.0, -ac / aa - reach)
+    high = jnp.minimum(1.0, -ac / aa + reach)
+    middle = jnp.clip(0.5 * (low + high), -1.0, 1.0)
+    crossing = jnp.clip((ab * bc - ac * bb) / jnp.where(parallel, 1.0, determinant), -1.0, 1.0)
+    s = jnp.where(parallel, middle, crossing)
+    t = jnp.clip((ab * s + bc) / bb, -1.0, 1.0)
+    s = jnp.where(parallel & (jnp.abs(t) < 1.0), s, jnp.clip((ab * t - ac) / aa, -1.0, 1.0))
+    on_first = first.centre + s[..., None] * first.half
+    on_second = second.centre + t[..., None] * second.half
+    apart = on_second - on_first
+    normal = normalise(apart, jnp.array([0.0, 0.0, 1.0], apart.dtype))
+    distance = norm(apart) - first.radius - second.radius
+    point = 0.5 * (on_first + first.radius[..., None] * normal + on_second - second.radius[..., None] * normal)
+    return Closest(normal, distance, point, jnp.stack([s, t], axis=-1))
+
+
+def moved(segment: Segment, velocity: Array, angular_velocity: Array, time: Array) -> Segment:
+    """The segment after `time` (*,) [s] at constant velocity (*, 3) [m/s] and angular velocity (*, 3) [rad/s].
+
+    The axis turns to first order and keeps its length.
+    """
+    time = time[..., None]
+    turned = segment.half + time * jnp.cross(angular_velocity, segment.half)
+    shrink = norm(segment.half) / jnp.maximum(norm(turned), 1e-12)
+    return Segment(segment.centre + time * velocity, turned * shrink[..., None], segment.radius)
+
+
+def time_of_impact(distance: Array, approach: Array, limit: Array | float) -> Array:
+    """(*,) [s] until a gap `distance` closes at speed `approach`, within [0, limit]; `limit` if it does not."""
+    closing = approach > 1e-3
+    time = jnp.maximum(distance, 0.0) / jnp.where(closing, approach, 1.0)
+    return jnp.where(closing | (distance <= 0.0), jnp.minimum(time, limit), limit)
+
+
+def impact(depth: Array, approach: Array, acceleration: Array | float, surface: Surface, time: Array) -> Impact:
+    """The damped spring of `surface`, solved in closed form over `time` (*,) [s] from touching bodies.
+
+    depth: (*,) [m] of penetration. approach: (*,) [m/s]. acceleration: [m/s^2] towards contact. The depth p follows
+    p'' = (1 - d) a - d (k p + b p'), d the impedance, until it returns to zero; then the bodies part.
+    """
+    decay = 0.5 * IMPEDANCE * surface.damping
+    frequency = jnp.sqrt(max(IMPEDANCE * surface.stiffness - decay**2, 0.01 * surface.stiffness))
+    equilibrium = (1.0 - IMPEDANCE) * acceleration / (IMPEDANCE * surface.stiffness)
+    offset = depth - equilibrium
+    rate = (approach + decay * offset) / frequency
+    at_rest = jnp.abs(rate) + jnp.abs(offset) < 1e-9
+    rate = jnp.where(at_rest, 1e-9, rate)
+    amplitude = jnp.sqrt(offset**2 + rate**2)
+    phase = jnp.arctan2(offset, rate)
+    balance = jnp.clip(equilibrium / amplitude, -0.999, 0.999)
+    until = (jnp.pi + jnp.arcsin(balance) - phase) / frequency
+    touching = jnp.clip(until, 0.0, time)
+    angle, envelope = frequency * touching, jnp.exp(-decay * touching)
+    cosine, sine = envelope * jnp.cos(angle), envelope * jnp.sin(angle)
+    end_depth = offset * cosine + rate * sine + equilibrium
+    end_rate = (rate * frequency - decay * offset) * cosine - (offset * frequency + decay * rate) * sine
+    free = time - touching
+    change = jnp.maximum(approach + acceleration * touching - end_rate, 0.0)
+    gap = -end_depth - end_rate * free - 0.5 * acceleration * free**2
+    travel = gap + depth + approach * time + 0.5 * acceleration * time**2
+    meaningful = change > 1e-4
+    lag = jnp.clip(jnp.where(meaningful, travel / jnp.where(meaningful, change, 1.0), 0.5 * time), 0.0, time)
+    return Impact(change, lag, gap)

@@ -1,0 +1,113 @@
+"""Error against the truth: by horizon, in joints, and of the velocity with which a struck body leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from larp_model import features, rotation
+from larp_model import state as packed
+from larp_model.simulator import Simulator
+from larp_model.training import Trajectories, first_contacts
+
+# The launch is read this many steps after first contact, of balls faster than this [m/s].
+LAUNCH_STEPS = 8
+LAUNCH_SPEED = 1.5
+# Beyond this a prediction has diverged [m].
+DIVERGED = 20.0
+
+
+def predict(
+    simulator: Simulator, states: np.ndarray, controls: np.ndarray, torques: np.ndarray, chunk: int = 128
+) -> np.ndarray:
+    """States (E, H, L, 13) that the simulator predicts from states (E, L, 13), chunk by chunk."""
+    roll = jax.jit(simulator.rollout)
+    parts = []
+    for begin in range(0, len(states), chunk):
+        rows = np.minimum(np.arange(begin, begin + chunk), len(states) - 1)
+        parts.append(
+            np.asarray(roll(jnp.asarray(states[rows]), jnp.asarray(controls[rows]), jnp.asarray(torques[rows])))
+        )
+    return np.concatenate(parts)[: len(states)]
+
+
+def evaluate(simulator: Simulator, episodes: Trajectories, windows: Sequence[int]) -> dict[str, Any]:
+    """Errors over the first n steps of every episode, n in `windows`, and of the launch; see `launch`.
+
+    windows: {n: {body: mean distance of its links [m]}}; rotation_rad and displacement_m over the longest window.
+    """
+    longest = max(windows)
+    if episodes.controls.shape[1] < longest:
+        raise ValueError(f"episodes have {episodes.controls.shape[1]} steps, but the windows need {longest}")
+    scene = simulator.scene
+    predicted = predict(simulator, episodes.states[:, 0], episodes.controls[:, :longest], episodes.torques[:, :longest])
+    true = episodes.states[:, 1 : longest + 1]
+    distance = np.linalg.norm(predicted[..., packed.POSITION] - true[..., packed.POSITION], axis=-1)
+    lost = ~(np.isfinite(distance).all(axis=(1, 2)) & (distance.max(axis=(1, 2)) < DIVERGED))
+    kept = ~lost
+    relative = rotation.multiply(
+        jnp.asarray(predicted[kept][..., packed.ORIENTATION]),
+        rotation.conjugate(jnp.asarray(true[kept][..., packed.ORIENTATION])),
+    )
+    apart = features.displacement(scene, jnp.asarray(predicted[kept]), features.morphology(scene))
+    return {
+        "windows": {
+            str(n): {body.name: float(distance[kept, :n, scene.rows(body.name)].mean()) for body in scene.bodies}
+            for n in windows
+        },
+        "rotation_rad": {
+            body.name: float(
+                jnp.linalg.norm(rotation.to_rotation_vector(relative[:, :, scene.rows(body.name)]), axis=-1).mean()
+            )
+            for body in scene.bodies
+            if not body.is_ball
+        },
+        "displacement_m": float(jnp.linalg.norm(apart, axis=-1).mean()) if apart.shape[-2] else 0.0,
+        "sequences": len(episodes.states),
+        "diverged": int(lost.sum()),
+        "launch": {str(before): launch(simulator, episodes, before) for before in (0, 3)} if scene.pairs else {},
+    }
+
+
+def launch(simulator: Simulator, episodes: Trajectories, before: int) -> dict[str, Any]:
+    """Error of a struck body's velocity `LAUNCH_STEPS` after first contact, from the truth `before` steps ahead of it.
+
+    Over bodies that leave faster than `LAUNCH_SPEED`; relative_error is |v - v'| / |v|, angle_deg between them.
+    """
+    scene = simulator.scene
+    struck = scene.index(scene.pairs[0].second, scene.pairs[0].second_links[0])
+    contacts = first_contacts(scene, episodes.states)
+    steps = before + LAUNCH_STEPS
+    rows = np.flatnonzero((contacts >= before) & (contacts + LAUNCH_STEPS <= episodes.controls.shape[1]))
+    rows = rows[speed(episodes.states[rows, contacts[rows] + LAUNCH_STEPS, struck]) > LAUNCH_SPEED]
+    if not len(rows):
+        return {"count": 0}
+    start = contacts[rows] - before
+    columns = start[:, None] + np.arange(steps)
+    predicted = predict(
+        simulator, episodes.states[rows, start], episodes.controls[rows[:, None], columns],
+        episodes.torques[rows[:, None], columns],
+    )[:, -1, struck, packed.VELOCITY]  # fmt: skip
+    true = episodes.states[rows, start + steps, struck, packed.VELOCITY]
+    size = np.linalg.norm(true, axis=-1)
+    error = np.linalg.norm(predicted - true, axis=-1) / size
+    cosine = np.sum(predicted * true, axis=-1) / np.maximum(size * np.linalg.norm(predicted, axis=-1), 1e-9)
+    return {
+        "count": len(rows),
+        "relative_error": quantiles(error),
+        "angle_deg": quantiles(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))),
+    }
+
+
+def speed(links: np.ndarray) -> np.ndarray:
+    """Speed (*,) [m/s] of links (*, 13)."""
+    return np.linalg.norm(links[..., packed.VELOCITY], axis=-1)
+
+
+def quantiles(values: np.ndarray) -> dict[str, float]:
+    """Median, 75th and 90th percentile."""
+    return {name: float(np.quantile(values, q)) for name, q in (("median", 0.5), ("p75", 0.75), ("p90", 0.9))}

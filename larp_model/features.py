@@ -1,0 +1,368 @@
+"""Inputs of the networks: what they see of a body, of a ball and of a contact; and their normalisation.
+
+Everything is invariant to shifts along the ground; in the heading frame also to turns about z.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from larp_model import contact, rotation
+from larp_model import state as packed
+from larp_model.scene import Body, Pair, Scene
+
+# Scale of the pooled contact features, an impulse [N s] and its moment [N m s].
+IMPULSE_SCALE = 1.0, 0.1
+# Normalised inputs are held within this many standard deviations.
+RANGE = 10.0
+
+
+class Statistics(NamedTuple):
+    """Mean and spread of a feature vector (F,), from data; features that never vary keep spread 1."""
+
+    mean: Array
+    spread: Array
+
+    @staticmethod
+    def of(samples: Array, weight: Array | None = None) -> Statistics:
+        """Statistics of samples (N, F), each counted by its weight (N,)."""
+        share = jnp.ones(samples.shape[0]) if weight is None else weight
+        share = (share / share.sum())[:, None]
+        mean = jnp.sum(share * samples, axis=0)
+        spread = jnp.sqrt(jnp.sum(share * (samples - mean) ** 2, axis=0))
+        return Statistics(mean, jnp.where(spread > 1e-5, spread, 1.0))
+
+    def normalise(self, features: Array) -> Array:
+        """Features (*, F) in standard deviations from the mean, within +-RANGE."""
+        return jnp.clip((features - self.mean) / self.spread, -RANGE, RANGE)
+
+    def restore(self, outputs: Array) -> Array:
+        """Outputs (*, F) in their own units."""
+        return outputs * self.spread + self.mean
+
+
+def morphology(scene: Scene) -> Array:
+    """Length [m], radius [m] and mass [kg] of every link of the scene, (L, 3)."""
+    return jnp.array([(link.length, link.radius, link.mass) for link in scene.links], jnp.float32)
+
+
+def anchors(points: list[tuple[float, float, float]], axes: list[tuple[float, float, float]], shape: Array) -> Array:
+    """Joint anchors (*, J, 3) [m] in the frames of links of morphology `shape` (*, J, 3)."""
+    axis, point = np.asarray(axes, np.float32), np.asarray(points, np.float32)
+    along = np.sum(axis * point, axis=-1, keepdims=True) * axis
+    return 0.5 * shape[..., 0:1] * along + shape[..., 1:2] * (point - along)
+
+
+def displacement(scene: Scene, state: Array, shape: Array) -> Array:
+    """Joint displacement (*, number of joints, 3) [m], world frame: the joint by the child, less by the parent."""
+    joints = list(scene.joints())
+    if not joints:
+        return jnp.zeros((*state.shape[:-2], 0, 3), state.dtype)
+    children, parents = [c for c, _, _ in joints], [p for _, p, _ in joints]
+    links = scene.links
+    matrices = rotation.matrix(packed.orientation(state))
+    places = []
+    for found, points in (
+        (children, [j.child_anchor for _, _, j in joints]),
+        (parents, [j.parent_anchor for _, _, j in joints]),
+    ):
+        rows = np.array(found)
+        offset = anchors(points, [links[r].axis for r in rows], shape[..., rows, :])
+        places.append(packed.position(state)[..., rows, :] + _apply(matrices[..., rows, :, :], offset))
+    return places[0] - places[1]
+
+
+def _apply(matrices: Array, vectors: Array) -> Array:
+    return jnp.sum(matrices * vectors[..., None, :], axis=-1)
+
+
+def _apply_inverse(matrices: Array, vectors: Array) -> Array:
+    """Vectors (*, V, 3) seen from the frames (*, 3, 3)."""
+    return jnp.sum(matrices[..., None, :, :] * vectors[..., :, None], axis=-2)
+
+
+def _flat(*parts: Array) -> Array:
+    """Features (B, ...) side by side, (B, F)."""
+    return jnp.concatenate([part.reshape(part.shape[0], -1) for part in parts], axis=-1)
+
+
+def body_inputs(
+    body: Body, turn: Array, state: Array, control: Array, torque: Array, apart: Array, pooled: Array, shape: Array
+) -> Array:
+    """Inputs (B, F) of the dynamics network, in the frame turned by `turn` (B, 2) about z.
+
+    state (B, n, 13), control (B, j, 3), torque (B, n, 3), joint displacement `apart` (B, n - 1, 3), pooled contact
+    features (B, n, 6), shape (B or 1, n, 3) of the body's n links. As the paper lists them: root-relative position,
+    height, rotation matrix, velocities, length, radius, displacement, target quaternion, torque, contact feature.
+    """
+    size, links = state.shape[0], len(body.links)
+    position = packed.position(state)
+    columns = jnp.moveaxis(rotation.matrix(packed.orientation(state)), -1, -2)
+    vectors = jnp.concatenate(
+        [
+            position - position[:, :1],
+            columns.reshape(size, 3 * links, 3),
+            packed.velocity(state),
+            packed.angular_velocity(state),
+            apart,
+            torque,
+            pooled[..., :3] / IMPULSE_SCALE[0],
+            pooled[..., 3:] / IMPULSE_SCALE[1],
+        ],
+        axis=1,
+    )
+    turned = rotation.about_z(vectors, rotation.opposite(turn)[:, None])
+    targets = rotation.from_rotation_vector(control)
+    sizes = jnp.broadcast_to(shape[..., :2], (size, links, 2))
+    return _flat(turned, position[..., 2], targets, sizes)
+
+
+def body_statistics(statistics: Statistics, body: Body) -> Statistics:
+    """The statistics of `body_inputs` with the pooled contact features left as they are scaled."""
+    links = len(body.links)
+    start = 3 * (links + 3 * links + links + links + (links - 1) + links)
+    fixed = slice(start, start + 6 * links)
+    return Statistics(statistics.mean.at[fixed].set(0.0), statistics.spread.at[fixed].set(1.0))
+
+
+class Ground(NamedTuple):
+    """A ball and the ground within one step: scalars (B, F) for its network and what they are made of."""
+
+    inputs: Array
+    bounce: contact.Impact
+    near: Array
+    slip: Array
+
+
+def ball_inputs(body: Body, state: Array, pooled: Array, shape: Array, gravity: float, dt: float) -> Ground:
+    """Inputs of a ball's network: scalars only, so that turning the world about z changes nothing.
+
+    state (B, 13), pooled impulse (B, 6), shape (B or 1, 3). slip (B, 3): velocity of the ball's lowest point [m/s].
+    near (B,): 1 where the ball touches the ground within the step, falling to 0 over 1 cm above it.
+    """
+    radius = shape[..., 1]
+    velocity, spin = packed.velocity(state), packed.angular_velocity(state)
+    gap, falling = state[..., 2] - radius, -velocity[..., 2]
+    closing = falling + 0.5 * gravity * dt
+    start = contact.time_of_impact(gap, closing, dt)
+    bounce = contact.impact(jnp.maximum(-gap, 0.0), falling + gravity * start, gravity, body.surface, dt - start)
+    lowest = jnp.minimum(gap, gap - closing * dt)
+    near = smooth_gate(lowest, 0.01)
+    up = jnp.array([0.0, 0.0, 1.0], state.dtype)
+    slip = (velocity - radius[..., None] * jnp.cross(spin, up)) * (1.0 - up)
+    along = velocity * (1.0 - up)
+    inputs = jnp.stack(
+        [
+            jnp.clip(lowest, -0.05, 0.05),
+            falling,
+            start,
+            bounce.change,
+            bounce.lag,
+            contact.norm(slip),
+            contact.norm(along),
+            jnp.sum(slip * along, axis=-1),
+            spin[..., 2],
+            pooled[..., 2],
+            contact.norm(pooled[..., :3]),
+        ],
+        axis=-1,
+    )
+    return Ground(inputs, bounce, near, slip)
+
+
+def smooth_gate(gap: Array, margin: float) -> Array:
+    """1 where gap <= 0, 0 where gap >= margin, and smooth between."""
+    x = jnp.clip(1.0 - gap / margin, 0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)
+
+
+class Touch(NamedTuple):
+    """Contact of P pairs of links within one step; vectors (B, P, 3) in the world frame.
+
+    inputs: (B, P, F) for the contact network, in the first link's frame. impact: along the normal. near: (B, P).
+    normal: from the first to the second. slide: tangential velocity [m/s] of the first against the second.
+    first_arm, second_arm: from the links' centres to the contact [m]. mass: reduced mass [kg] of the two links.
+    """
+
+    inputs: Array
+    impact: contact.Impact
+    near: Array
+    normal: Array
+    slide: Array
+    first_arm: Array
+    second_arm: Array
+    mass: Array
+
+
+def pair_rows(scene: Scene, pair: Pair) -> tuple[np.ndarray, np.ndarray]:
+    """Rows in the state of the first and second link of every pair of links that can touch, (P,) each."""
+    rows = [
+        (scene.index(pair.first, first), scene.index(pair.second, second))
+        for first in pair.first_links
+        for second in pair.second_links
+    ]
+    first, second = np.array(rows).T
+    return first, second
+
+
+def _segments(scene: Scene, state: Array, rows: np.ndarray, matrices: Array, shape: Array) -> contact.Segment:
+    axes = np.array([scene.links[row].axis for row in rows], np.float32)
+    half = _apply(matrices, 0.5 * shape[..., rows, 0:1] * axes)
+    radius = jnp.broadcast_to(shape[..., rows, 1], (*state.shape[:-2], len(rows)))
+    return contact.Segment(packed.position(state)[..., rows, :], half, radius)
+
+
+def contact_inputs(scene: Scene, pair: Pair, state: Array, control: Array, shape: Array) -> Touch:
+    """The contacts of `pair` in states (B, L, 13) under control (B, J, 3), at the moment the links meet in the step.
+
+    Both links move on at their velocities until they meet (conservative advancement); the gap, normal and speeds are
+    those of that moment, so that a foot that crosses the ball within a step is seen.
+    """
+    first, second = pair_rows(scene, pair)
+    matrices = rotation.matrix(packed.orientation(state))
+    turn = matrices[..., first, :, :]
+    velocity, spin = packed.velocity(state), packed.angular_velocity(state)
+    a = _segments(scene, state, first, turn, shape)
+    b = _segments(scene, state, second, matrices[..., second, :, :], shape)
+    v1, v2, w1, w2 = velocity[..., first, :], velocity[..., second, :], spin[..., first, :], spin[..., second, :]
+
+    def closest_at(time: Array) -> tuple[contact.Closest, Array, Array, Array, Array]:
+        one, two = contact.moved(a, v1, w1, time), contact.moved(b, v2, w2, time)
+        found = contact.closest(one, two)
+        arm1, arm2 = found.point - one.centre, found.point - two.centre
+        relative = v1 + jnp.cross(w1, arm1) - v2 - jnp.cross(w2, arm2)
+        return found, arm1, arm2, relative, jnp.sum(relative * found.normal, axis=-1)
+
+    time = jnp.zeros(a.radius.shape, state.dtype)
+    now, *_, approach = closest_at(time)
+    found_gap = now.distance
+    for _ in range(contact.ADVANCES):
+        time = time + contact.time_of_impact(found_gap, approach, scene.dt - time)
+        found, arm1, arm2, relative, approach = closest_at(time)
+        found_gap = found.distance
+    remaining = scene.dt - time
+    impact = contact.impact(jnp.maximum(-found.distance, 0.0), approach, 0.0, pair.surface, remaining)
+    lowest = jnp.minimum(now.distance, found.distance)
+    near = smooth_gate(lowest, 0.03)
+    slide = relative - approach[..., None] * found.normal
+
+    up = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0], state.dtype), v1.shape)
+    context = _joint_context(scene, first, state, matrices, control)
+    vectors = jnp.stack([found.normal, arm1, relative, v1, w1, w2, up, *context], axis=-2)
+    local = _apply_inverse(turn, vectors)
+    scalars = jnp.stack(
+        [
+            jnp.clip(now.distance, -0.1, 0.2),
+            jnp.clip(lowest, -0.05, 0.05),
+            remaining,
+            approach,
+            impact.change,
+            impact.lag,
+            impact.gap,
+            b.centre[..., 2] - b.radius,
+            v2[..., 2],
+        ],
+        axis=-1,
+    )
+    which = jnp.broadcast_to(jnp.eye(len(first), dtype=state.dtype), (*time.shape, len(first)))
+    inputs = jnp.concatenate([local.reshape(*time.shape, -1), scalars, which], axis=-1)
+    m1, m2 = shape[..., first, 2], shape[..., second, 2]
+    return Touch(inputs, impact, near, found.normal, slide, arm1, arm2, m1 * m2 / (m1 + m2))
+
+
+def _joint_context(scene: Scene, rows: np.ndarray, state: Array, matrices: Array, control: Array) -> list[Array]:
+    """How each link is held: axis and spin of its parent and grandparent, and both joint targets, as world vectors."""
+    parent_of = {child: parent for child, parent, _ in scene.joints()}
+    motor_of = {
+        scene.rows(body.name).start + child: scene.motor_rows(body.name).start + index
+        for body in scene.bodies
+        for index, (child, _, _) in enumerate(body.motors)
+    }
+    spin = packed.angular_velocity(state)
+    context = []
+    link = list(rows)
+    for _ in range(2):
+        parents = [parent_of.get(int(row), int(row)) for row in link]
+        axes = jnp.array([scene.links[row].axis for row in parents], state.dtype)
+        context += [_apply(matrices[..., np.array(parents), :, :], axes), spin[..., np.array(parents), :]]
+        motors = np.array([motor_of.get(int(row), -1) for row in link])
+        target = control[..., motors, :] * (motors >= 0)[:, None] if control.shape[-2] else jnp.zeros_like(context[0])
+        context.append(_apply(matrices[..., np.array(parents), :, :], target))
+        link = parents
+    return context
+
+
+def paper_contact_inputs(scene: Scene, pair: Pair, state: Array, shape: Array) -> tuple[Array, Array]:
+    """Inputs (B, P, F) of the paper's f_c as each of the two links sees the other, world frame.
+
+    phi of both links (position relative to the first body's root, quaternion, velocities, length, radius, mass), and
+    of c(.) the contact point relative to the link, the normal and the distance, at the start of the step.
+    """
+    first, second = pair_rows(scene, pair)
+    matrices = rotation.matrix(packed.orientation(state))
+    found = contact.closest(
+        _segments(scene, state, first, matrices[..., first, :, :], shape),
+        _segments(scene, state, second, matrices[..., second, :, :], shape),
+    )
+    root = state[..., scene.rows(pair.first).start, :3] * jnp.array([1.0, 1.0, 0.0], state.dtype)
+    sizes = jnp.broadcast_to(shape, (*state.shape[:-2], *shape.shape[-2:]))
+    phi = jnp.concatenate([packed.position(state) - root[..., None, :], state[..., 3:], sizes], axis=-1)
+    distance = found.distance[..., None]
+
+    def seen(me: np.ndarray, other: np.ndarray, normal: Array) -> Array:
+        arm = found.point - packed.position(state)[..., me, :]
+        return jnp.concatenate([phi[..., me, :], phi[..., other, :], arm, normal, distance], axis=-1)
+
+    return seen(first, second, found.normal), seen(second, first, -found.normal)
+
+
+def random_turns(key: Array, count: int) -> Array:
+    """Cosines and sines (count, 2) of uniform turns about z."""
+    angle = jax.random.uniform(key, (count,), maxval=2.0 * jnp.pi)
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+
+
+def turn_states(state: Array, turn: Array) -> Array:
+    """States (*, L, 13) turned about the world's z by `turn` (*, 2)."""
+    turn = turn[..., None, :]
+    half = jnp.arctan2(turn[..., 1], turn[..., 0]) / 2.0
+    zero = jnp.zeros_like(half)
+    quaternion = jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)], axis=-1)
+    return packed.pack(
+        rotation.about_z(packed.position(state), turn),
+        rotation.multiply(quaternion, packed.orientation(state)),
+        rotation.about_z(packed.velocity(state), turn),
+        rotation.about_z(packed.angular_velocity(state), turn),
+    )
+
+
+def first_contact(scene: Scene, states: Array) -> Array:
+    """(E,) the first step t of states (E, T + 1, L, 13) in which a pair's contact changes the second link's velocity.
+
+    The contact falls between states t and t + 1. -1 where there is none.
+    """
+    if not scene.pairs:
+        return jnp.full(states.shape[0], -1)
+    shape = morphology(scene)[None]
+    idle = jnp.zeros((states.shape[0], len(scene.motors), 3), states.dtype)
+    free = jnp.array([0.0, 0.0, -scene.gravity * scene.dt], states.dtype)
+
+    def hit(before: Array, after: Array) -> Array:
+        found = jnp.zeros(before.shape[0], bool)
+        for pair in scene.pairs:
+            _, second = pair_rows(scene, pair)
+            pushed = contact.norm(packed.velocity(after) - packed.velocity(before) - free)[:, second] > 0.3
+            found |= jnp.any((contact_inputs(scene, pair, before, idle, shape).near > 0.1) & pushed, axis=1)
+        return found
+
+    def advance(carry: None, step: tuple[Array, Array]) -> tuple[None, Array]:
+        return carry, hit(*step)
+
+    by_time = jnp.moveaxis(states, 1, 0)
+    _, hits = jax.lax.scan(advance, None, (by_time[:-1], by_time[1:]))
+    return jnp.where(hits.any(axis=0), jnp.argmax(hits, axis=0), -1)

@@ -1,0 +1,70 @@
+"""f_d and f_c: multi-layer perceptrons with ELU, and the configurations they come in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import flax.linen as nn
+import jax
+from jax import Array
+
+
+@dataclass(frozen=True)
+class Config:
+    """What distinguishes one learned simulator from another.
+
+    frame: the dynamics network sees the world's axes, or those of the body's heading. predict: it gives the next
+    velocity, integrated semi-implicitly as in the paper, or the change of velocity and a correction of the trapezoidal
+    step. contact: the contact network gives a free feature vector, or an impulse along the contact's own directions,
+    which balls take up directly and articulated bodies see as a feature. skip: residual connections.
+    """
+
+    name: str
+    layers: int
+    width: int
+    contact_layers: int
+    contact_width: int
+    ball_layers: int
+    ball_width: int
+    frame: Literal["world", "heading"]
+    predict: Literal["velocity", "change"]
+    contact: Literal["feature", "impulse"]
+    skip: bool
+
+    def __post_init__(self) -> None:
+        for field in ("layers", "width", "contact_layers", "contact_width", "ball_layers", "ball_width"):
+            value = getattr(self, field)
+            if not (isinstance(value, int) and value >= 1):
+                raise ValueError(f"config.{field} is {value!r}, but must be an integer of at least 1")
+        for field, choices in (
+            ("frame", ("world", "heading")),
+            ("predict", ("velocity", "change")),
+            ("contact", ("feature", "impulse")),
+        ):
+            if getattr(self, field) not in choices:
+                raise ValueError(f"config.{field} is {getattr(self, field)!r}, but must be one of {choices}")
+
+
+PAPER = Config("paper", 12, 512, 6, 128, 12, 128, "world", "velocity", "feature", skip=False)
+COMPACT = Config("compact", 6, 256, 3, 96, 2, 32, "heading", "change", "impulse", skip=True)
+CONFIGS = {config.name: config for config in (PAPER, COMPACT)}
+
+
+class Perceptron(nn.Module):
+    """`layers` dense layers of `width` with ELU between them, the last one giving `outputs` values."""
+
+    layers: int
+    width: int
+    outputs: int
+    skip: bool
+
+    @nn.compact
+    def __call__(self, inputs: Array) -> Array:
+        """(*, F) -> (*, outputs)."""
+        hidden = inputs
+        for index in range(self.layers - 1):
+            new = jax.nn.elu(nn.Dense(self.width)(hidden))
+            hidden = hidden + new if self.skip and index else new
+        last = nn.initializers.variance_scaling(0.01, "fan_in", "truncated_normal")
+        return nn.Dense(self.outputs, kernel_init=last)(hidden)

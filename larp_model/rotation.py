@@ -1,0 +1,72 @@
+"""Rotations of packed arrays: brax.math over leading dimensions, and what it lacks.
+
+Quaternions are (*, 4), w first. Everything here has finite gradients at zero angle.
+"""
+
+from __future__ import annotations
+
+import brax.math
+import jax.numpy as jnp
+from jax import Array
+
+multiply = jnp.vectorize(brax.math.quat_mul, signature="(4),(4)->(4)")
+matrix = jnp.vectorize(brax.math.quat_to_3x3, signature="(4)->(3,3)")
+
+
+def conjugate(quaternion: Array) -> Array:
+    """The inverse of unit quaternions (*, 4)."""
+    return quaternion * jnp.array([1.0, -1.0, -1.0, -1.0], quaternion.dtype)
+
+
+def from_rotation_vector(vector: Array) -> Array:
+    """Unit quaternions (*, 4) of rotation vectors (*, 3) [rad]: the exponential map."""
+    squared = jnp.sum(vector**2, axis=-1, keepdims=True)
+    small = squared < 1e-8
+    angle = jnp.sqrt(jnp.where(small, 1.0, squared))
+    scale = jnp.where(small, 0.5 - squared / 48.0, jnp.sin(0.5 * angle) / angle)
+    real = jnp.where(small, 1.0 - squared / 8.0, jnp.cos(0.5 * angle))
+    return jnp.concatenate([real, scale * vector], axis=-1)
+
+
+def to_rotation_vector(quaternion: Array) -> Array:
+    """Rotation vectors (*, 3) [rad], at most pi long, of unit quaternions (*, 4): the logarithm."""
+    quaternion = jnp.where(quaternion[..., :1] < 0.0, -quaternion, quaternion)
+    real, imaginary = quaternion[..., :1], quaternion[..., 1:]
+    squared = jnp.sum(imaginary**2, axis=-1, keepdims=True)
+    small = squared < 1e-8
+    norm = jnp.sqrt(jnp.where(small, 1.0, squared))
+    scale = jnp.where(small, 2.0 + squared / 3.0, 2.0 * jnp.arctan2(norm, real) / norm)
+    return scale * imaginary
+
+
+def integrate(quaternion: Array, rotation_vector: Array) -> Array:
+    """Turn orientations (*, 4) by world-frame rotation vectors (*, 3) [rad], keeping them of unit length."""
+    turned = multiply(from_rotation_vector(rotation_vector), quaternion)
+    return turned / jnp.linalg.norm(turned, axis=-1, keepdims=True)
+
+
+def heading(quaternion: Array) -> Array:
+    """Cosine and sine (*, 2) of the turn about z in orientations (*, 4) (swing-twist decomposition).
+
+    Turning an orientation about z turns its heading by the same angle. It is undefined where the body stands on its
+    head; there the heading is x and its gradient zero.
+    """
+    real, along = quaternion[..., 0], quaternion[..., 3]
+    squared = real**2 + along**2
+    degenerate = squared < 1e-8
+    squared = jnp.where(degenerate, 1.0, squared)
+    cosine = jnp.where(degenerate, 1.0, (real**2 - along**2) / squared)
+    sine = jnp.where(degenerate, 0.0, 2.0 * real * along / squared)
+    return jnp.stack([cosine, sine], axis=-1)
+
+
+def about_z(vector: Array, turn: Array) -> Array:
+    """Turn vectors (*, 3) about z by the angle of cosine and sine `turn` (*, 2)."""
+    cosine, sine = turn[..., 0], turn[..., 1]
+    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
+    return jnp.stack([cosine * x - sine * y, sine * x + cosine * y, z], axis=-1)
+
+
+def opposite(turn: Array) -> Array:
+    """Cosine and sine (*, 2) of the opposite angle."""
+    return turn * jnp.array([1.0, -1.0], turn.dtype)

@@ -1,0 +1,267 @@
+"""Frozen, hashable descriptions of articulated bodies and of the scene they share.
+
+A `Body` is a tree of capsule links. Every link frame sits at the link's centre of mass, and in the rest pose all
+link frames of a body are parallel, so that a joint target of zero means the rest pose. Nothing here knows JAX or an
+engine: the truth, the learned model, the planner and the viewer all read the same description.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+Vector = tuple[float, float, float]
+
+
+def _check(owner: str, name: str, value: float, minimum: float, *, strict: bool) -> None:
+    if not (math.isfinite(value) and (value > minimum if strict else value >= minimum)):
+        relation = ">" if strict else ">="
+        raise ValueError(f"{owner}.{name} is {value!r}, but must be a finite number {relation} {minimum:g}")
+
+
+def _check_vector(owner: str, name: str, value: Vector) -> None:
+    if len(value) != 3 or not all(math.isfinite(v) for v in value):
+        raise ValueError(f"{owner}.{name} is {value!r}, but must be three finite numbers")
+
+
+@dataclass(frozen=True)
+class Link:
+    """A capsule of uniform density.
+
+    length: distance between the centres of its two hemispheres [m]; 0 makes it a ball.
+    radius: [m]. mass: [kg]. axis: unit vector along the capsule, in the link frame.
+    """
+
+    name: str
+    length: float
+    radius: float
+    mass: float
+    axis: Vector = (0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        owner = f"link {self.name!r}"
+        _check(owner, "length", self.length, 0.0, strict=False)
+        _check(owner, "radius", self.radius, 0.0, strict=True)
+        _check(owner, "mass", self.mass, 0.0, strict=True)
+        _check_vector(owner, "axis", self.axis)
+        if abs(math.hypot(*self.axis) - 1.0) > 1e-6:
+            raise ValueError(f"{owner}.axis is {self.axis!r}, but must have unit length")
+
+
+@dataclass(frozen=True)
+class Motor:
+    """A PD servo on the rotation vector of a ball joint.
+
+    stiffness: [N m/rad]. damping: [N m s/rad]. torque_limit: per axis [N m].
+    lower, upper: bounds of the joint target, a rotation vector relative to the parent [rad].
+    """
+
+    stiffness: float
+    damping: float
+    torque_limit: float
+    lower: Vector
+    upper: Vector
+
+    def __post_init__(self) -> None:
+        _check("motor", "stiffness", self.stiffness, 0.0, strict=True)
+        _check("motor", "damping", self.damping, 0.0, strict=False)
+        _check("motor", "torque_limit", self.torque_limit, 0.0, strict=True)
+        _check_vector("motor", "lower", self.lower)
+        _check_vector("motor", "upper", self.upper)
+        if any(low > high for low, high in zip(self.lower, self.upper, strict=True)):
+            raise ValueError(f"motor.lower is {self.lower!r}, but must not exceed motor.upper {self.upper!r}")
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A ball joint that ties a link to its parent.
+
+    The anchors are dimensionless, so that they follow the link's size: along the link's axis in units of half its
+    length, across it in units of its radius. damping: passive [N m s/rad], for joints without a motor.
+    """
+
+    parent: int
+    parent_anchor: Vector
+    child_anchor: Vector
+    motor: Motor | None = None
+    damping: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_vector("joint", "parent_anchor", self.parent_anchor)
+        _check_vector("joint", "child_anchor", self.child_anchor)
+        _check("joint", "damping", self.damping, 0.0, strict=False)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """How two bodies push each other: a damped spring on their penetration r, r'' = -stiffness r - damping r'.
+
+    stiffness: [1/s^2]. damping: [1/s]; both are per unit of effective mass, as in MuJoCo. friction: Coulomb's.
+    """
+
+    stiffness: float
+    damping: float
+    friction: float
+
+    def __post_init__(self) -> None:
+        _check("surface", "stiffness", self.stiffness, 0.0, strict=True)
+        _check("surface", "damping", self.damping, 0.0, strict=False)
+        _check("surface", "friction", self.friction, 0.0, strict=False)
+
+    @staticmethod
+    def bouncing(contact_time: float, restitution: float, friction: float) -> Surface:
+        """The surface whose free impact lasts `contact_time` [s] and returns `restitution` of the approach speed."""
+        _check("surface", "contact_time", contact_time, 0.0, strict=True)
+        if not 0.0 < restitution <= 1.0:
+            raise ValueError(f"surface.restitution is {restitution!r}, but must be in (0, 1]")
+        decay = -math.log(restitution) / contact_time
+        frequency = math.pi / contact_time
+        return Surface(frequency**2 + decay**2, 2.0 * decay, friction)
+
+
+@dataclass(frozen=True)
+class Body:
+    """A tree of links. `joints[i]` ties `links[i + 1]` to a link before it; `links[0]` is the free root.
+
+    kind: bodies of one kind share one dynamics network. surface: contact with the ground.
+    """
+
+    name: str
+    kind: str
+    links: tuple[Link, ...]
+    joints: tuple[Joint, ...] = ()
+    surface: Surface = field(default_factory=lambda: Surface(4000.0, 120.0, 1.0))
+
+    def __post_init__(self) -> None:
+        if not self.links:
+            raise ValueError(f"body {self.name!r} has no links, but needs at least one")
+        if len(self.joints) != len(self.links) - 1:
+            raise ValueError(
+                f"body {self.name!r} has {len(self.joints)} joints, but its {len(self.links)} links need "
+                f"{len(self.links) - 1}"
+            )
+        for child, joint in enumerate(self.joints, start=1):
+            if not 0 <= joint.parent < child:
+                raise ValueError(
+                    f"body {self.name!r}: the parent of link {child} is {joint.parent}, but must be in [0, {child})"
+                )
+        names = [link.name for link in self.links]
+        if len(set(names)) != len(names):
+            raise ValueError(f"body {self.name!r} has link names {names}, but they must differ")
+
+    @property
+    def is_ball(self) -> bool:
+        """Whether the body is one sphere, so that no direction of its frame matters."""
+        return len(self.links) == 1 and self.links[0].length == 0.0
+
+    @property
+    def motors(self) -> tuple[tuple[int, Joint, Motor], ...]:
+        """(child link, joint, motor) of each motorised joint."""
+        return tuple((i, j, j.motor) for i, j in enumerate(self.joints, start=1) if j.motor is not None)
+
+    def link(self, name: str) -> int:
+        """Index of a link by name."""
+        for index, link in enumerate(self.links):
+            if link.name == name:
+                return index
+        raise ValueError(f"body {self.name!r} has no link {name!r}; it has {[link.name for link in self.links]}")
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two bodies that can touch, with the links of each that can; what is not named is not simulated."""
+
+    first: str
+    second: str
+    first_links: tuple[str, ...]
+    second_links: tuple[str, ...]
+    surface: Surface
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Bodies, which of them can touch, the time step [s] of states and controls, and gravity [m/s^2]."""
+
+    bodies: tuple[Body, ...]
+    pairs: tuple[Pair, ...] = ()
+    dt: float = 0.01
+    gravity: float = 9.81
+
+    def __post_init__(self) -> None:
+        _check("scene", "dt", self.dt, 0.0, strict=True)
+        _check("scene", "gravity", self.gravity, 0.0, strict=False)
+        names = [body.name for body in self.bodies]
+        if not names or len(set(names)) != len(names):
+            raise ValueError(f"scene.bodies are named {names}, but need one or more different names")
+        for pair in self.pairs:
+            if pair.first == pair.second:
+                raise ValueError(
+                    f"scene.pairs names {pair.first!r} twice: contact of a body with itself is not modelled"
+                )
+            for name, links in ((pair.first, pair.first_links), (pair.second, pair.second_links)):
+                if not links:
+                    raise ValueError(f"scene.pairs names no link of {name!r}, but needs at least one")
+                for link in links:
+                    self.body(name).link(link)
+
+    def body(self, name: str) -> Body:
+        """The body of that name."""
+        for body in self.bodies:
+            if body.name == name:
+                return body
+        raise ValueError(f"scene has no body {name!r}; it has {[body.name for body in self.bodies]}")
+
+    def rows(self, name: str) -> slice:
+        """The rows of a body in the state."""
+        start = 0
+        for body in self.bodies:
+            if body.name == name:
+                return slice(start, start + len(body.links))
+            start += len(body.links)
+        raise ValueError(f"scene has no body {name!r}; it has {[body.name for body in self.bodies]}")
+
+    def motor_rows(self, name: str) -> slice:
+        """The rows of a body in the control."""
+        start = 0
+        for body in self.bodies:
+            count = len(body.motors)
+            if body.name == name:
+                return slice(start, start + count)
+            start += count
+        raise ValueError(f"scene has no body {name!r}; it has {[body.name for body in self.bodies]}")
+
+    def index(self, body: str, link: str) -> int:
+        """The row of a link in the state."""
+        return self.rows(body).start + self.body(body).link(link)
+
+    @property
+    def links(self) -> tuple[Link, ...]:
+        """All links, in the order of the state."""
+        return tuple(link for body in self.bodies for link in body.links)
+
+    @property
+    def motors(self) -> tuple[Motor, ...]:
+        """All motors, in the order of the control."""
+        return tuple(motor for body in self.bodies for _, _, motor in body.motors)
+
+    def joints(self) -> Iterator[tuple[int, int, Joint]]:
+        """(row of the child, row of the parent, joint) for every joint."""
+        for body in self.bodies:
+            start = self.rows(body.name).start
+            for child, joint in enumerate(body.joints, start=1):
+                yield start + child, start + joint.parent, joint
+
+    def only(self, *names: str) -> Scene:
+        """The scene with these bodies alone."""
+        pairs = tuple(p for p in self.pairs if p.first in names and p.second in names)
+        return Scene(tuple(self.body(name) for name in names), pairs, self.dt, self.gravity)
+
+
+def anchor(point: Vector, length: np.ndarray, radius: np.ndarray, axis: Vector) -> np.ndarray:
+    """A joint anchor in its link's frame [m], (*, 3), for links of `length` and `radius` (*,) [m]."""
+    direction, offset = np.asarray(axis), np.asarray(point)
+    along = offset @ direction * direction
+    return 0.5 * length[..., None] * along + radius[..., None] * (offset - along)

@@ -1,0 +1,361 @@
+"""LARP: one step is contact -> dynamics -> integrate; a rollout repeats it.
+
+M. Andriluka et al., "Learned neural physics simulation for articulated 3D human pose reconstruction" (2024), with the
+choices of `networks.Config`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from larp_model import features, rotation
+from larp_model import state as packed
+from larp_model.features import Statistics
+from larp_model.networks import Config, Perceptron
+from larp_model.scene import Body, Pair, Scene
+
+# Solid spheres: moment of inertia / (mass x radius^2).
+SPHERE = 0.4
+CONTACT_COEFFICIENTS = 6
+BALL_COEFFICIENTS = 8
+
+
+class Weights(NamedTuple):
+    """Everything that is learned or measured: network parameters and statistics, by kind of body or pair.
+
+    networks: {"dynamics/human": flax parameters, "contact/human-ball": ...}. inputs: Statistics by the same names.
+    outputs: those of the dynamics networks whose outputs are changes of state.
+    """
+
+    networks: dict[str, Any]
+    inputs: dict[str, Statistics]
+    outputs: dict[str, Statistics]
+
+
+def dynamics_name(body: Body) -> str:
+    """Name of the network of a body's kind."""
+    return f"dynamics/{body.kind}"
+
+
+def contact_name(scene: Scene, pair: Pair) -> str:
+    """Name of the network of a pair's kinds."""
+    return f"contact/{scene.body(pair.first).kind}-{scene.body(pair.second).kind}"
+
+
+def by_scalars(config: Config, body: Body) -> bool:
+    """Whether a body is a ball whose network sees invariant scalars instead of a frame."""
+    return config.frame == "heading" and body.is_ball
+
+
+def dynamics_network(config: Config, body: Body) -> Perceptron:
+    """f_d for a body's kind."""
+    if by_scalars(config, body):
+        return Perceptron(config.ball_layers, config.ball_width, BALL_COEFFICIENTS, config.skip)
+    outputs = len(body.links) * (6 if config.predict == "velocity" else 12)
+    layers, width = (config.ball_layers, config.ball_width) if body.is_ball else (config.layers, config.width)
+    return Perceptron(layers, width, outputs, config.skip)
+
+
+def evaluate(network: Perceptron, weights: Weights, name: str, inputs: Array) -> Array:
+    """Outputs (*, O) of a network for its inputs (*, F), normalised first."""
+    outputs = network.apply(weights.networks[name], weights.inputs[name].normalise(inputs))
+    assert isinstance(outputs, jax.Array)
+    return outputs
+
+
+def contact_network(config: Config) -> Perceptron:
+    """f_c."""
+    outputs = CONTACT_COEFFICIENTS if config.contact == "impulse" else 6
+    return Perceptron(config.contact_layers, config.contact_width, outputs, config.skip)
+
+
+class Pooled(NamedTuple):
+    """What all contacts do to each link in a step: feature or impulse and moment (B, L, 6), and the share of the step
+    times impulse that acts on the position, (B, L, 3) [N s^2]."""
+
+    feature: Array
+    travel: Array
+
+
+def contacts(scene: Scene, config: Config, weights: Weights, state: Array, control: Array, shape: Array) -> Pooled:
+    """Sum f_c over the contacts of every link (equation 1 of the paper). state (B, L, 13), control (B, J, 3)."""
+    size, links = state.shape[0], len(scene.links)
+    feature, travel = jnp.zeros((size, links, 6), state.dtype), jnp.zeros((size, links, 3), state.dtype)
+    for pair in scene.pairs:
+        name = contact_name(scene, pair)
+        first, second = features.pair_rows(scene, pair)
+        to_first, to_second = jax.nn.one_hot(first, links), jax.nn.one_hot(second, links)
+        network = partial(evaluate, contact_network(config), weights, name)
+        if config.contact == "feature":
+            inputs = features.paper_contact_inputs(scene, pair, state, shape)
+            for seen, rows in zip(inputs, (to_first, to_second), strict=True):
+                feature += jnp.einsum("bpf,pl->blf", network(seen), rows)
+            continue
+        touch = features.contact_inputs(scene, pair, state, control, shape)
+        outputs = network(touch.inputs) * touch.near[..., None]
+        impulse, lag = contact_impulse(touch, outputs)
+        on_first = jnp.concatenate([-impulse, jnp.cross(touch.first_arm, -impulse)], axis=-1)
+        on_second = jnp.concatenate([impulse, jnp.cross(touch.second_arm, impulse)], axis=-1)
+        feature += jnp.einsum("bpf,pl->blf", on_first, to_first) + jnp.einsum("bpf,pl->blf", on_second, to_second)
+        moved = impulse * lag
+        travel += jnp.einsum("bpf,pl->blf", moved, to_second) - jnp.einsum("bpf,pl->blf", moved, to_first)
+    return Pooled(feature, travel)
+
+
+def contact_impulse(touch: features.Touch, outputs: Array) -> tuple[Array, Array]:
+    """Impulse (B, P, 3) [N s] on the second link and its lag (B, P, 1) [s], from the network's gated outputs (B, P, 6).
+
+    Along the normal: the free impact's, which the network scales and adds to; across it: along the slide, the binormal
+    and, for the ground's reaction, up.
+    """
+    scale, add, along, across, up, late = jnp.split(outputs, CONTACT_COEFFICIENTS, axis=-1)
+    change = touch.impact.change[..., None]
+    normal = change * (1.0 + scale) + add
+    vertical = jnp.array([0.0, 0.0, 1.0], outputs.dtype)
+    velocity = (
+        normal * touch.normal + along * touch.slide + across * jnp.cross(touch.normal, touch.slide) + up * vertical
+    )
+    lag = touch.impact.lag[..., None] + 0.001 * late
+    return touch.mass[..., None, None][..., 0] * velocity, lag
+
+
+def step(
+    scene: Scene,
+    config: Config,
+    weights: Weights,
+    state: Array,
+    control: Array,
+    torque: Array | None = None,
+    shape: Array | None = None,
+    stop_gradient: bool = False,
+) -> Array:
+    """Advance states (B, L, 13) by `scene.dt` under joint targets (B, J, 3) [rad].
+
+    torque: external, (B, L, 3) [N m], world frame. shape: morphology (B or 1, L, 3); the scene's by default.
+    stop_gradient: hold the contact's inputs fixed, as in the paper's training; never when planning.
+    """
+    torque = jnp.zeros((*state.shape[:-1], 3), state.dtype) if torque is None else torque
+    shape = features.morphology(scene)[None] if shape is None else shape
+    seen = jax.lax.stop_gradient(state) if stop_gradient else state
+    pooled = contacts(scene, config, weights, seen, control, shape)
+    apart = features.displacement(scene, state, shape)
+    parts, joint = [], 0
+    for body in scene.bodies:
+        rows, motors = scene.rows(body.name), scene.motor_rows(body.name)
+        own = Pooled(pooled.feature[:, rows], pooled.travel[:, rows])
+        if by_scalars(config, body):
+            parts.append(ball_step(scene, config, weights, body, state[:, rows], own, shape[:, rows]))
+            continue
+        joints = slice(joint, joint + len(body.joints))
+        parts.append(
+            body_step(
+                scene, config, weights, body, state[:, rows], control[:, motors], torque[:, rows], apart[:, joints],
+                own.feature, shape[:, rows],
+            )
+        )  # fmt: skip
+        joint += len(body.joints)
+    return jnp.concatenate(parts, axis=1)
+
+
+def body_step(
+    scene: Scene, config: Config, weights: Weights, body: Body, state: Array, control: Array, torque: Array,
+    apart: Array, pooled: Array, shape: Array,
+) -> Array:  # fmt: skip
+    """One step of a body (B, n, 13) through its dynamics network."""
+    name, links = dynamics_name(body), len(body.links)
+    turn = frame(config, state)
+    inputs = features.body_inputs(body, turn, state, control, torque, apart, pooled, shape)
+    outputs = evaluate(dynamics_network(config, body), weights, name, inputs)
+    outputs = weights.outputs[name].restore(outputs).reshape(state.shape[0], -1, 3)
+    change = rotation.about_z(outputs, turn[:, None]).reshape(state.shape[0], -1, links, 3)
+    return integrate(config, state, change, scene.dt)
+
+
+def frame(config: Config, state: Array) -> Array:
+    """Cosine and sine (B, 2) of the frame in which a body (B, n, 13) is seen."""
+    if config.frame == "heading":
+        return rotation.heading(packed.orientation(state)[:, 0])
+    return jnp.broadcast_to(jnp.array([1.0, 0.0], state.dtype), (state.shape[0], 2))
+
+
+def integrate(config: Config, state: Array, outputs: Array, dt: float) -> Array:
+    """The next states (B, n, 13) from the dynamics network's outputs (B, 2 or 4, n, 3), world frame.
+
+    `velocity`: velocity and angular velocity, x' = x + v' dt, as in the paper. `change`: their changes, and
+    corrections [m, rad] of x' = x + (v + v') dt / 2, which an impact within the step needs.
+    """
+    if config.predict == "velocity":
+        velocity, spin = outputs[:, 0], outputs[:, 1]
+        moved, turned = velocity * dt, spin * dt
+    else:
+        velocity = packed.velocity(state) + outputs[:, 0]
+        spin = packed.angular_velocity(state) + outputs[:, 1]
+        moved = 0.5 * dt * (packed.velocity(state) + velocity) + outputs[:, 2]
+        turned = 0.5 * dt * (packed.angular_velocity(state) + spin) + outputs[:, 3]
+    return packed.pack(
+        packed.position(state) + moved, rotation.integrate(packed.orientation(state), turned), velocity, spin
+    )
+
+
+def changes(config: Config, state: Array, after: Array, dt: float) -> Array:
+    """The outputs (B, 2 or 4, n, 3) with which `integrate` would give `after`: what the output statistics measure."""
+    velocity, spin = packed.velocity(after), packed.angular_velocity(after)
+    if config.predict == "velocity":
+        return jnp.stack([velocity, spin], axis=1)
+    moved = packed.position(after) - packed.position(state)
+    relative = rotation.multiply(packed.orientation(after), rotation.conjugate(packed.orientation(state)))
+    turned = rotation.to_rotation_vector(relative)
+    before, spinning = packed.velocity(state), packed.angular_velocity(state)
+    return jnp.stack(
+        [
+            velocity - before,
+            spin - spinning,
+            moved - 0.5 * dt * (before + velocity),
+            turned - 0.5 * dt * (spinning + spin),
+        ],
+        axis=1,
+    )
+
+
+def ball_step(
+    scene: Scene, config: Config, weights: Weights, body: Body, state: Array, pooled: Pooled, shape: Array
+) -> Array:
+    """One step of a ball (B, 1, 13): free flight, the impulses of its contacts, and a learned bounce and slide.
+
+    Away from every contact it is exact free flight.
+    """
+    name, dt = dynamics_name(body), scene.dt
+    ball, impulse, shape = state[:, 0], pooled.feature[:, 0], shape[:, 0]
+    radius, mass = shape[:, 1:2], shape[:, 2:3]
+    ground = features.ball_inputs(body, ball, impulse, shape, scene.gravity, dt)
+    outputs = evaluate(dynamics_network(config, body), weights, name, ground.inputs)
+    outputs = outputs * ground.near[:, None]
+    scale, add, stick, drag, grip, roll, twist, late = jnp.split(outputs, BALL_COEFFICIENTS, axis=-1)
+    up = jnp.array([0.0, 0.0, 1.0], state.dtype)
+    velocity, spin = packed.velocity(ball), packed.angular_velocity(ball)
+    along = velocity * (1.0 - up)
+    kick = impulse[:, :3] / mass
+    bounce = ground.bounce.change[:, None] * (1.0 + scale) + add
+    lag = ground.bounce.lag[:, None] + 0.001 * late
+    slide = -stick * ground.slip - drag * along
+    new_velocity = velocity - scene.gravity * dt * up + kick + bounce * up + slide
+    moment = impulse[:, 3:] / (SPHERE * mass * radius**2)
+    rolling = (grip * jnp.cross(up, ground.slip) + roll * jnp.cross(up, along)) / (SPHERE * radius)
+    new_spin = spin + moment + rolling - twist * spin * up
+    moved = (
+        velocity * dt
+        - 0.5 * scene.gravity * dt**2 * up
+        + pooled.travel[:, 0] / mass
+        + bounce * lag * up
+        + 0.5 * dt * slide
+    )
+    turned = 0.5 * dt * (spin + new_spin)
+    return packed.pack(
+        packed.position(ball) + moved, rotation.integrate(packed.orientation(ball), turned), new_velocity, new_spin
+    )[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class Simulator:
+    """A scene with learned weights: pure, jit-able, batched, differentiable."""
+
+    scene: Scene
+    config: Config
+    weights: Weights
+
+    differentiable = True
+
+    def step(self, state: Array, control: Array, torque: Array | None = None, shape: Array | None = None) -> Array:
+        """States (N, L, 13) after one `scene.dt` under controls (N, J, 3) [rad]."""
+        return step(self.scene, self.config, self.weights, state, control, torque, shape)
+
+    def rollout(self, state: Array, controls: Array, torques: Array | None = None, shape: Array | None = None) -> Array:
+        """States (N, H, L, 13) after each of H steps from states (N, L, 13) under controls (N, H, J, 3) [rad].
+
+        torques: external, (N, H, L, 3) [N m]. shape: morphology (N or 1, L, 3); the scene's by default.
+        """
+        links, motors = len(self.scene.links), len(self.scene.motors)
+        if state.ndim != 3 or state.shape[1:] != (links, packed.SIZE):
+            raise ValueError(f"state has shape {state.shape}, but needs (N, {links}, {packed.SIZE})")
+        if controls.ndim != 4 or controls.shape[0] != state.shape[0] or controls.shape[2:] != (motors, 3):
+            raise ValueError(f"controls have shape {controls.shape}, but need ({state.shape[0]}, H, {motors}, 3)")
+        return rollout(self.scene, self.config, self.weights, state, controls, torques, shape)
+
+
+def rollout(
+    scene: Scene, config: Config, weights: Weights, state: Array, controls: Array, torques: Array | None = None,
+    shape: Array | None = None, stop_gradient: bool = False,
+) -> Array:  # fmt: skip
+    """States (B, H, L, 13) after each of H steps; the arguments are those of `step`, with a time axis second."""
+
+    def advance(current: Array, inputs: tuple[Array, Array | None]) -> tuple[Array, Array]:
+        control, torque = inputs
+        after = step(scene, config, weights, current, control, torque, shape, stop_gradient)
+        return after, after
+
+    by_time = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), (controls, torques))
+    _, states = jax.lax.scan(advance, state, by_time)
+    return jnp.moveaxis(states, 0, 1)
+
+
+Measured = dict[str, tuple[Statistics, Statistics | None]]
+
+
+def initial_weights(scene: Scene, config: Config, key: Array, statistics: Measured) -> Weights:
+    """Fresh networks for the scene; `statistics` holds (inputs, outputs) by network name."""
+    networks: dict[str, Any] = {}
+    modules = {dynamics_name(body): dynamics_network(config, body) for body in scene.bodies}
+    modules |= {contact_name(scene, pair): contact_network(config) for pair in scene.pairs}
+    for index, (name, module) in enumerate(sorted(modules.items())):
+        size = statistics[name][0].mean.shape[0]
+        networks[name] = module.init(jax.random.fold_in(key, index), jnp.zeros((1, size)))
+    inputs = {name: statistics[name][0] for name in networks}
+    outputs = {name: found for name in networks if (found := statistics[name][1]) is not None}
+    return Weights(networks, inputs, outputs)
+
+
+def measure(scene: Scene, config: Config, before: Array, after: Array, control: Array, torque: Array) -> Measured:
+    """Statistics of inputs and outputs by network, from true steps (B, L, 13) -> (B, L, 13).
+
+    Those of contacts are taken where there is one, for elsewhere their networks are not heard.
+    """
+    shape = features.morphology(scene)[None]
+    apart, joint = features.displacement(scene, before, shape), 0
+    pooled = jnp.zeros((*before.shape[:2], 6))
+    rarely = 1e-3
+    found: Measured = {}
+    for body in scene.bodies:
+        rows, motors = scene.rows(body.name), scene.motor_rows(body.name)
+        state = before[:, rows]
+        if by_scalars(config, body):
+            ground = features.ball_inputs(
+                body, state[:, 0], pooled[:, rows][:, 0], shape[:, rows][:, 0], scene.gravity, scene.dt
+            )
+            found[dynamics_name(body)] = Statistics.of(ground.inputs, ground.near + rarely), None
+            continue
+        joints = slice(joint, joint + len(body.joints))
+        joint += len(body.joints)
+        turn = frame(config, state)
+        inputs = features.body_inputs(
+            body, turn, state, control[:, motors], torque[:, rows], apart[:, joints], pooled[:, rows], shape[:, rows]
+        )
+        outputs = changes(config, state, after[:, rows], scene.dt).reshape(state.shape[0], -1, 3)
+        outputs = rotation.about_z(outputs, rotation.opposite(turn)[:, None]).reshape(state.shape[0], -1)
+        statistics = features.body_statistics(Statistics.of(inputs), body)
+        found[dynamics_name(body)] = statistics, Statistics.of(outputs)
+    for pair in scene.pairs:
+        touch = features.contact_inputs(scene, pair, before, control, shape)
+        near = touch.near.reshape(-1) + rarely
+        if config.contact == "feature":
+            seen = jnp.concatenate(features.paper_contact_inputs(scene, pair, before, shape), axis=1)
+            near = jnp.tile(touch.near, (1, 2)).reshape(-1) + rarely
+        else:
+            seen = touch.inputs
+        found[contact_name(scene, pair)] = Statistics.of(seen.reshape(-1, seen.shape[-1]), near), None
+    return found

@@ -1,0 +1,41 @@
+"""The packed state: one array (*, L, 13) for all links of a scene, and its named views.
+
+Columns: position of the centre of mass [m], orientation quaternion (w, x, y, z), velocity [m/s], angular velocity
+[rad/s]; all in the world frame.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+
+SIZE = 13
+POSITION = slice(0, 3)
+ORIENTATION = slice(3, 7)
+VELOCITY = slice(7, 10)
+ANGULAR_VELOCITY = slice(10, 13)
+
+
+def position(state: Array) -> Array:
+    """(*, L, 3) [m], world frame."""
+    return state[..., POSITION]
+
+
+def orientation(state: Array) -> Array:
+    """(*, L, 4) quaternion w, x, y, z from the link to the world."""
+    return state[..., ORIENTATION]
+
+
+def velocity(state: Array) -> Array:
+    """(*, L, 3) [m/s], world frame, of the centre of mass."""
+    return state[..., VELOCITY]
+
+
+def angular_velocity(state: Array) -> Array:
+    """(*, L, 3) [rad/s], world frame."""
+    return state[..., ANGULAR_VELOCITY]
+
+
+def pack(position: Array, orientation: Array, velocity: Array, angular_velocity: Array) -> Array:
+    """The state (*, L, 13) of its four parts."""
+    return jnp.concatenate([position, orientation, velocity, angular_velocity], axis=-1)

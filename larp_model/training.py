@@ -1,0 +1,252 @@
+"""Algorithm 1 of the paper: unrolled loss, curriculum, gradient clipping and dropping, resume."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import orbax.checkpoint as ocp
+from jax import Array
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from larp_model import features, losses
+from larp_model.losses import LossWeights
+from larp_model.networks import Config
+from larp_model.scene import Scene
+from larp_model.simulator import Weights, initial_weights, measure, rollout
+
+
+class Trajectories(Protocol):
+    """Recorded truth: states (E, T + 1, L, 13), controls (E, T, J, 3) [rad], torques (E, T, L, 3) [N m]."""
+
+    @property
+    def states(self) -> np.ndarray: ...
+    @property
+    def controls(self) -> np.ndarray: ...
+    @property
+    def torques(self) -> np.ndarray: ...
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How to train.
+
+    curriculum: (unroll in steps, share of the updates) in order. learning_rate falls to `final` of itself by a cosine.
+    clip: largest gradient norm. drop: norm beyond which a batch is dropped. contact_share: windows that start within
+    `before_contact` steps before the first contact. emphasis: weight of each body's links in the loss.
+    """
+
+    updates: int = 20000
+    batch: int = 256
+    curriculum: tuple[tuple[int, float], ...] = ((4, 0.15), (8, 0.2), (20, 0.65))
+    learning_rate: float = 1e-3
+    final: float = 0.01
+    clip: float = 0.3
+    drop: float = 30.0
+    contact_share: float = 0.7
+    before_contact: int = 10
+    emphasis: tuple[tuple[str, float], ...] = (("ball", 3.0),)
+    loss: LossWeights = field(default_factory=LossWeights)
+    stop_gradient: bool = True
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("updates", "batch"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"recipe.{name} is {getattr(self, name)!r}, but must be at least 1")
+        if abs(sum(share for _, share in self.curriculum) - 1.0) > 1e-6:
+            raise ValueError(f"recipe.curriculum is {self.curriculum!r}, but its shares must sum to 1")
+
+    def unroll(self, update: int) -> int:
+        """Steps unrolled at an update."""
+        done = 0.0
+        for steps, share in self.curriculum:
+            done += share * self.updates
+            if update < done:
+                return steps
+        return self.curriculum[-1][0]
+
+
+class Progressed(NamedTuple):
+    """What training carries, and what a checkpoint holds."""
+
+    networks: dict[str, Any]
+    optimiser: Any
+    update: int
+
+
+class Windows:
+    """Draws training windows from sources of trajectories, each source with its share."""
+
+    def __init__(self, scene: Scene, sources: Sequence[tuple[Trajectories, float]], recipe: Recipe) -> None:
+        self.sources, self.recipe = [source for source, _ in sources], recipe
+        share = np.array([share for _, share in sources], float)
+        self.share = share / share.sum()
+        self.contacts = [first_contacts(scene, source.states) for source in self.sources]
+
+    def draw(self, random: np.random.Generator, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """States (B, steps + 1, L, 13), controls (B, steps, J, 3) and torques (B, steps, L, 3)."""
+        counts = random.multinomial(self.recipe.batch, self.share)
+        parts = []
+        for source, contacts, count in zip(self.sources, self.contacts, counts, strict=True):
+            struck = np.flatnonzero(contacts >= 0)
+            near = min(round(self.recipe.contact_share * count), count if len(struck) else 0)
+            anywhere = random.integers(len(contacts), size=count - near)
+            chosen = np.concatenate([struck[random.integers(len(struck), size=near)] if near else struck[:0], anywhere])
+            last = source.controls.shape[1] - steps
+            if last < 0:
+                raise ValueError(f"episodes have {source.controls.shape[1]} steps, but the unroll needs {steps}")
+            start = random.integers(last + 1, size=count)
+            back = random.integers(self.recipe.before_contact + 1, size=near)
+            start[:near] = np.clip(contacts[chosen[:near]] - back, 0, last)
+            columns = start[:, None] + np.arange(steps + 1)
+            rows = chosen[:, None]
+            parts.append(
+                (
+                    source.states[rows, columns],
+                    source.controls[rows, columns[:, :-1]],
+                    source.torques[rows, columns[:, :-1]],
+                )
+            )
+        states, controls, torques = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return states, controls, torques
+
+
+def first_contacts(scene: Scene, states: np.ndarray, chunk: int = 512) -> np.ndarray:
+    """`features.first_contact` (E,) of many trajectories (E, T + 1, L, 13), chunk by chunk."""
+    found = jax.jit(partial(features.first_contact, scene))
+    padded = np.concatenate([states, np.repeat(states[-1:], -len(states) % chunk, axis=0)])
+    parts = [np.asarray(found(padded[i : i + chunk])) for i in range(0, len(padded), chunk)]
+    return np.concatenate(parts)[: len(states)]
+
+
+def statistics_of(
+    scene: Scene, config: Config, windows: Windows, random: np.random.Generator, batches: int = 32
+) -> Weights:
+    """Fresh weights, their statistics measured on single true steps drawn as in training."""
+    drawn = [windows.draw(random, 2) for _ in range(batches)]
+    states, controls, torques = (np.concatenate(column) for column in zip(*drawn, strict=True))
+    turns = features.random_turns(jax.random.key(int(random.integers(2**31))), len(states))
+    if config.frame == "world":
+        states = np.asarray(features.turn_states(jnp.asarray(states), turns[:, None]))
+    found = jax.jit(partial(measure, scene, config))(states[:, 0], states[:, 1], controls[:, 0], torques[:, 0])
+    return initial_weights(scene, config, jax.random.key(int(random.integers(2**31))), found)
+
+
+def emphasis(scene: Scene, recipe: Recipe) -> Array:
+    """Weight (L,) of each link in the loss."""
+    factors = dict(recipe.emphasis)
+    return jnp.array([factors.get(body.name, 1.0) for body in scene.bodies for _ in body.links], jnp.float32)
+
+
+def optimiser(recipe: Recipe) -> optax.GradientTransformation:
+    """Adam behind a clipped gradient norm, its rate on a cosine."""
+    warm = min(500, recipe.updates // 10 + 1)
+    schedule = optax.warmup_cosine_decay_schedule(
+        0.0, recipe.learning_rate, warm, max(recipe.updates, warm + 1), recipe.learning_rate * recipe.final
+    )
+    return optax.chain(optax.clip_by_global_norm(recipe.clip), optax.adam(schedule))
+
+
+def train(
+    scene: Scene,
+    config: Config,
+    recipe: Recipe,
+    sources: Sequence[tuple[Trajectories, float]],
+    folder: Path,
+    start: Weights | None = None,
+    quiet: bool = False,
+) -> tuple[Weights, dict[str, Any]]:
+    """Train on sources of (trajectories, share); returns the weights and a log of loss, norms and drops.
+
+    folder: where checkpoints are kept; a run cut off there goes on from its last. start: weights to go on from instead
+    of fresh ones. Where a hundred batches in a row are dropped, the last good weights are returned and the log says so.
+    """
+    random = np.random.default_rng(recipe.seed)
+    windows = Windows(scene, sources, recipe)
+    weights = statistics_of(scene, config, windows, random) if start is None else start
+    transform = optimiser(recipe)
+    progressed = Progressed(weights.networks, transform.init(weights.networks), 0)
+    manager = ocp.CheckpointManager(folder.absolute(), options=ocp.CheckpointManagerOptions(max_to_keep=1, create=True))
+    if manager.latest_step() is not None:
+        restored = manager.restore(manager.latest_step(), args=ocp.args.StandardRestore((progressed, weights[1:])))
+        progressed, statistics = Progressed(*restored[0]), restored[1]
+        weights = Weights(progressed.networks, *statistics)
+    weigh = emphasis(scene, recipe)
+
+    def loss_of(
+        networks: dict[str, Any], states: Array, controls: Array, torques: Array
+    ) -> tuple[Array, dict[str, Array]]:
+        predicted = rollout(
+            scene, config, weights._replace(networks=networks), states[:, 0], controls, torques,
+            stop_gradient=recipe.stop_gradient,
+        )  # fmt: skip
+        return losses.total(scene, recipe.loss, weigh, predicted, states[:, 1:])
+
+    @partial(jax.jit, donate_argnums=(0, 1))
+    def update(
+        networks: dict[str, Any], state: Any, key: Array, states: Array, controls: Array, torques: Array
+    ) -> tuple[dict[str, Any], Any, dict[str, Array]]:
+        if config.frame == "world":
+            turn = features.random_turns(key, len(states))
+            states = features.turn_states(states, turn[:, None])
+            torques = features.rotation.about_z(torques, turn[:, None, None])
+        (loss, terms), gradient = jax.value_and_grad(loss_of, has_aux=True)(networks, states, controls, torques)
+        norm = optax.global_norm(gradient)
+        good = jnp.isfinite(norm) & (norm < recipe.drop)
+        gradient = jax.tree.map(lambda g: jnp.where(good, g, 0.0), gradient)
+        changes, new_state = transform.update(gradient, state, networks)
+        keep = partial(jax.tree.map, lambda new, old: jnp.where(good, new, old))
+        return (
+            keep(optax.apply_updates(networks, changes), networks),
+            keep(new_state, state),
+            terms | {"loss": loss, "norm": norm, "dropped": 1.0 - good},
+        )
+
+    log: dict[str, Any] = {"history": [], "dropped": 0, "stopped_early": False, "seconds": 0.0}
+    in_a_row, recent, begin, saved = 0, [], time.perf_counter(), time.perf_counter()
+    networks, state = progressed.networks, progressed.optimiser
+    first = int(progressed.update)
+    columns = (
+        TextColumn("training"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TextColumn("{task.fields[note]}"), TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, disable=quiet) as bar:
+        task = bar.add_task("", total=recipe.updates, completed=first, note="")
+        for index in range(first, recipe.updates):
+            drawn = windows.draw(np.random.default_rng((recipe.seed, index)), recipe.unroll(index))
+            key = jax.random.fold_in(jax.random.key(recipe.seed), index)
+            networks, state, terms = update(networks, state, key, *drawn)
+            values = {name: float(value) for name, value in terms.items()}
+            recent.append(values)
+            log["dropped"] += int(values["dropped"])
+            in_a_row = in_a_row + 1 if values["dropped"] else 0
+            if (index + 1) % 100 == 0 or index + 1 == recipe.updates:
+                now = time.perf_counter()
+                mean = {name: float(np.nanmean([row[name] for row in recent])) for name in values}
+                rate = (index + 1 - first) * recipe.batch / (now - begin)
+                log["history"].append({"update": index + 1, **mean, "sequences_per_second": rate})
+                note = f"loss {mean['loss']:.3g} position {mean['position'] ** 0.5:.4f} m {rate:.0f} sequences/s"
+                bar.update(task, completed=index + 1, note=note)
+                if quiet is None:
+                    print(index + 1, recipe.unroll(index), log["history"][-1], flush=True)
+                recent = []
+                if now - saved > 60 or index + 1 == recipe.updates:
+                    content = (Progressed(networks, state, index + 1), weights[1:])
+                    manager.save(index + 1, args=ocp.args.StandardSave(content))
+                    saved = now
+            if in_a_row >= 100:
+                log["stopped_early"] = True
+                break
+    manager.wait_until_finished()
+    manager.close()
+    log["seconds"] = time.perf_counter() - begin
+    return weights._replace(networks=networks), log

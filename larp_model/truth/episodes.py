@@ -1,0 +1,116 @@
+"""Truth episodes: recorded, joined, stored and read again."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from larp_model import state as packed
+from larp_model.scene import Scene
+from larp_model.truth.mujoco import Truth
+
+VERSION = 1
+
+
+class Episodes(NamedTuple):
+    """E recorded trajectories of T steps.
+
+    states: (E, T + 1, L, 13), the first before any step. controls: (E, T, J, 3) [rad]. torques: (E, T, L, 3) [N m],
+    external, world frame.
+    """
+
+    states: np.ndarray
+    controls: np.ndarray
+    torques: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    @property
+    def steps(self) -> int:
+        """T, the steps of each episode."""
+        return int(self.controls.shape[1])
+
+
+def record(
+    truth: Truth, states: np.ndarray, controls: np.ndarray, torques: np.ndarray | None = None
+) -> tuple[Episodes, int]:
+    """Roll out any number of controls (E, T, J, 3) from states (E, L, 13); returns the episodes and how many diverged.
+
+    Diverged trajectories are dropped.
+    """
+    count, links = len(states), len(truth.scene.links)
+    if controls.shape[0] != count:
+        raise ValueError(f"controls hold {controls.shape[0]} episodes, but states hold {count}")
+    if torques is None:
+        torques = np.zeros((*controls.shape[:2], links, 3), np.float32)
+    kept, dropped = [], 0
+    for start in range(0, count, truth.batch):
+        chosen = np.arange(start, start + truth.batch)
+        chosen[chosen >= count] = count - 1  # the last batch is filled up with copies
+        truth.reset(states[chosen])
+        first = truth.state()
+        after, finite = truth.rollout(states[chosen], controls[chosen], torques[chosen])
+        finite[count - start :] = False
+        dropped += int((~finite[: count - start]).sum())
+        whole = np.concatenate([first[:, None], after], axis=1)
+        rows = chosen[finite]
+        kept.append(
+            Episodes(
+                whole[finite].astype(np.float32), controls[rows].astype(np.float32), torques[rows].astype(np.float32)
+            )
+        )
+    return join(kept), dropped
+
+
+def join(parts: Sequence[Episodes]) -> Episodes:
+    """Several recordings of the same scene and length as one."""
+    return Episodes(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def save(path: Path, scene: Scene, episodes: Episodes) -> None:
+    """Write episodes to an .npz file, whole or not at all."""
+    header = json.dumps({"version": VERSION, "dt": scene.dt, "links": [link.name for link in scene.links]})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.partial")
+    with temporary.open("wb") as file:
+        np.savez(file, header=np.array(header), **episodes._asdict())
+    os.replace(temporary, path)
+
+
+def load(path: Path, scene: Scene) -> Episodes:
+    """Read episodes of this scene; refuses, by name, what is damaged or does not fit."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            header = json.loads(str(file["header"]))
+            episodes = Episodes(*(file[name] for name in Episodes._fields))
+    except FileNotFoundError:
+        raise ValueError(f"episodes file {path} does not exist") from None
+    except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
+        raise ValueError(f"episodes file {path} cannot be read: {type(error).__name__}: {error}") from None
+    if header.get("version") != VERSION:
+        raise ValueError(f"episodes file {path} is of version {header.get('version')}, but {VERSION} is needed")
+    links, motors = len(scene.links), len(scene.motors)
+    steps = episodes.controls.shape[1] if episodes.controls.ndim == 4 else 0
+    count = len(episodes.states)
+    expected = {
+        "states": (count, steps + 1, links, packed.SIZE),
+        "controls": (count, steps, motors, 3),
+        "torques": (count, steps, links, 3),
+    }
+    for name, shape in expected.items():
+        found = getattr(episodes, name)
+        if found.shape != shape:
+            raise ValueError(f"episodes file {path}: {name} has shape {found.shape}, but the scene needs {shape}")
+        if not np.isfinite(found).all():
+            raise ValueError(f"episodes file {path}: {name} holds values that are not finite")
+    if header.get("links") != [link.name for link in scene.links] or header.get("dt") != scene.dt:
+        raise ValueError(
+            f"episodes file {path} is of another scene: links {header.get('links')}, dt {header.get('dt')}"
+        )
+    return episodes

@@ -1,0 +1,180 @@
+"""The truth: a scene in MuJoCo, stepped in threaded batches, read and written as packed states.
+
+A step of `scene.dt` takes several engine steps, because the engine's usual steps are not converged for a kick: see
+`SUBSTEPS` and the test that holds it to its promise.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+from scipy.spatial.transform import Rotation
+
+from larp_model import state as packed
+from larp_model.scene import Body, Link, Scene, Surface, anchor
+
+# Halving the engine's step beyond this moves the ball's launch velocity by less than 1 % (median).
+SUBSTEPS = 16
+# Beyond these a trajectory has diverged [m, m/s, rad/s].
+LIMITS = ((packed.POSITION, 1e3), (packed.VELOCITY, 1e2), (packed.ANGULAR_VELOCITY, 1e3))
+
+
+def compile_model(scene: Scene, substeps: int = SUBSTEPS) -> mujoco.MjModel:
+    """The MuJoCo model of a scene, its sensors laid out as the packed state."""
+    if substeps < 1:
+        raise ValueError(f"substeps is {substeps!r}, but must be at least 1")
+    spec = mujoco.MjSpec()
+    spec.option.timestep = scene.dt / substeps
+    spec.option.gravity = [0.0, 0.0, -scene.gravity]
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    ground = spec.worldbody.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0])
+    ground.contype = ground.conaffinity = 0
+    for body in scene.bodies:
+        _add_body(spec, body)
+    for pair in scene.pairs:
+        for first in pair.first_links:
+            for second in pair.second_links:
+                _add_pair(spec, f"{pair.first}/{first}", f"{pair.second}/{second}", pair.surface)
+    return spec.compile()
+
+
+def _add_body(spec: mujoco.MjSpec, body: Body) -> None:
+    bodies: list[mujoco.MjsBody] = []
+    for index, link in enumerate(body.links):
+        name = f"{body.name}/{link.name}"
+        if index == 0:
+            added = spec.worldbody.add_body(name=name)
+            added.add_freejoint(name=name)
+        else:
+            joint = body.joints[index - 1]
+            child_anchor = _anchor(link, joint.child_anchor)
+            position = _anchor(body.links[joint.parent], joint.parent_anchor) - child_anchor
+            added = bodies[joint.parent].add_body(name=name, pos=position)
+            hinge = added.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_BALL, pos=child_anchor)
+            hinge.damping[0] = joint.damping if joint.motor is None else joint.motor.damping
+            if joint.motor is not None:
+                for axis in np.eye(3):
+                    servo = spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
+                    servo.gear[:3] = axis
+                    servo.set_to_position(kp=joint.motor.stiffness)
+                    limit = joint.motor.torque_limit
+                    servo.forcelimited, servo.forcerange = mujoco.mjtLimited.mjLIMITED_TRUE, [-limit, limit]
+        bodies.append(added)
+        reach = 0.5 * link.length * np.asarray(link.axis)
+        geom = added.add_geom(name=name, mass=link.mass, contype=0, conaffinity=0)
+        if link.length:
+            geom.type, geom.fromto = mujoco.mjtGeom.mjGEOM_CAPSULE, np.concatenate([-reach, reach])
+        else:
+            geom.type = mujoco.mjtGeom.mjGEOM_SPHERE
+        geom.size[0] = link.radius
+        _add_pair(spec, "ground", name, body.surface)
+    for added in bodies:
+        for sensor in ("FRAMEPOS", "FRAMEQUAT", "FRAMELINVEL", "FRAMEANGVEL"):
+            spec.add_sensor(
+                type=getattr(mujoco.mjtSensor, f"mjSENS_{sensor}"),
+                objtype=mujoco.mjtObj.mjOBJ_XBODY,
+                objname=added.name,
+            )
+
+
+def _anchor(link: Link, point: tuple[float, float, float]) -> np.ndarray:
+    return anchor(point, np.asarray(link.length), np.asarray(link.radius), link.axis)
+
+
+def _add_pair(spec: mujoco.MjSpec, first: str, second: str, surface: Surface) -> None:
+    pair = spec.add_pair(geomname1=first, geomname2=second, condim=3)
+    pair.solref = [-surface.stiffness, -surface.damping]
+    pair.solimp = [0.99, 0.99, 0.001, 0.5, 2.0]
+    pair.friction[:2] = max(surface.friction, 1e-5)
+
+
+class Truth:
+    """A batch of simulations of one scene."""
+
+    def __init__(self, scene: Scene, batch: int = 1, substeps: int = SUBSTEPS, threads: int = 0) -> None:
+        """batch: simulations side by side. substeps: engine steps in one `scene.dt`. threads: 0 takes all cores."""
+        self.scene = scene
+        self.substeps = substeps
+        self.model = compile_model(scene, substeps)
+        self._batch = Batch(self.model, nsim=batch, nthread=threads)
+        self._sensors = self._batch.bind("sensordata")  # refreshed by every call from here on
+        self._children = np.array([child for child, _, _ in scene.joints()], int)
+        self._parents = np.array([parent for _, parent, _ in scene.joints()], int)
+        self._joint = {name: self.model.joint(name).id for name in self._names()}
+
+    def _names(self) -> list[str]:
+        return [f"{body.name}/{link.name}" for body in self.scene.bodies for link in body.links]
+
+    @property
+    def batch(self) -> int:
+        """How many simulations run side by side."""
+        return int(self._batch.nsim)
+
+    def state(self) -> np.ndarray:
+        """The packed states (N, L, 13)."""
+        return np.array(self._sensors).reshape(self.batch, -1, packed.SIZE)
+
+    def reset(self, states: np.ndarray) -> None:
+        """Put the simulations into the packed states (N, L, 13), or all into the one state (L, 13).
+
+        Positions of links that are not roots follow from the joints: a state whose joints come apart is closed up.
+        """
+        states = np.broadcast_to(np.asarray(states, float), (self.batch, len(self.scene.links), packed.SIZE))
+        batch = self._batch
+        batch.reset(stage=mujoco.mjtStage.mjSTAGE_NONE)
+        qpos, qvel = batch.bind("qpos"), batch.bind("qvel")
+        rotation = Rotation.from_quat(states[..., packed.ORIENTATION].reshape(-1, 4), scalar_first=True)
+        matrix = rotation.as_matrix().reshape(*states.shape[:2], 3, 3)
+        omega = states[..., packed.ANGULAR_VELOCITY]
+        parents = {child: parent for child, parent, _ in self.scene.joints()}
+        for row, name in enumerate(self._names()):
+            joint = self._joint[name]
+            position, dof = self.model.jnt_qposadr[joint], self.model.jnt_dofadr[joint]
+            turned = matrix[:, row].transpose(0, 2, 1)
+            if row not in parents:
+                qpos[:, position : position + 3] = states[:, row, packed.POSITION]
+                qpos[:, position + 3 : position + 7] = states[:, row, packed.ORIENTATION]
+                qvel[:, dof : dof + 3] = states[:, row, packed.VELOCITY]
+                qvel[:, dof + 3 : dof + 6] = np.einsum("nij,nj->ni", turned, omega[:, row])
+            else:
+                parent = parents[row]
+                relative = Rotation.from_matrix(matrix[:, parent].transpose(0, 2, 1) @ matrix[:, row])
+                qpos[:, position : position + 4] = relative.as_quat(scalar_first=True)
+                qvel[:, dof : dof + 3] = np.einsum("nij,nj->ni", turned, omega[:, row] - omega[:, parent])
+        batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
+
+    def step(self, control: np.ndarray, torque: np.ndarray | None = None) -> np.ndarray:
+        """Advance by `scene.dt` under joint targets (N, J, 3) [rad] and torques on links (N, L, 3) [N m], world frame.
+
+        Returns the packed states (N, L, 13).
+        """
+        self._batch.bind("ctrl")[:] = np.asarray(control).reshape(self.batch, -1)
+        if torque is not None:
+            self._batch.bind("xfrc_applied").reshape(self.batch, -1, 6)[:, 1:, 3:] = torque
+        self._batch.step(nstep=self.substeps, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        return self.state()
+
+    def rollout(
+        self, states: np.ndarray, controls: np.ndarray, torques: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Roll controls (N, H, J, 3) out from states (N, L, 13).
+
+        Returns the states (N, H, L, 13) after each step, and (N,) which of the trajectories did not diverge.
+        """
+        self.reset(states)
+        steps = [
+            self.step(controls[:, t], None if torques is None else torques[:, t]) for t in range(controls.shape[1])
+        ]
+        result = np.stack(steps, axis=1)
+        return result, finite(result)
+
+
+def finite(states: np.ndarray) -> np.ndarray:
+    """(N,) which of the trajectories (N, H, L, 13) stayed finite and within physical limits."""
+    healthy = np.isfinite(states).all(axis=(1, 2, 3))
+    for columns, limit in LIMITS:
+        healthy &= (np.abs(np.nan_to_num(states[..., columns], nan=np.inf)) < limit).all(axis=(1, 2, 3))
+    return healthy

@@ -1,0 +1,26 @@
+"""The planner: optimises joint targets through any `Dynamics`; knows states, controls and costs only."""
+
+from mpc.cem import CEM
+from mpc.cost import CostTerm, absolute, evaluate, l2, quadratic
+from mpc.dynamics import Continued, Dynamics, MujocoDynamics
+from mpc.gradient import Gradient
+from mpc.planner import Plan, PlanInfo, Planner
+from mpc.spline import interpolate, shift
+
+__all__ = [
+    "CEM",
+    "Continued",
+    "CostTerm",
+    "Dynamics",
+    "Gradient",
+    "MujocoDynamics",
+    "Plan",
+    "PlanInfo",
+    "Planner",
+    "absolute",
+    "evaluate",
+    "interpolate",
+    "l2",
+    "quadratic",
+    "shift",
+]

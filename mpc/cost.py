@@ -1,0 +1,80 @@
+"""A cost is a sum of named terms, each residual x norm x weight, so that each can be plotted and tuned."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+Residual = Callable[[jax.Array, jax.Array, Any], jax.Array]
+Norm = Callable[[jax.Array], jax.Array]
+
+
+def quadratic(residual: jax.Array) -> jax.Array:
+    """Half the squared length of each vector: (*, R) -> (*)."""
+    return 0.5 * jnp.sum(residual**2, axis=-1)
+
+
+def l2(width: float) -> Norm:
+    """Length of each vector, (*, R) -> (*), rounded to a parabola below `width` (residual's unit)."""
+    _require_width(width)
+    return lambda residual: jnp.sqrt(jnp.sum(residual**2, axis=-1) + width**2) - width
+
+
+def absolute(width: float) -> Norm:
+    """Sum of the absolute components, (*, R) -> (*), each rounded off below `width` (residual's unit)."""
+    _require_width(width)
+    return lambda residual: jnp.sum(jnp.sqrt(residual**2 + width**2) - width, axis=-1)
+
+
+@dataclass(frozen=True)
+class CostTerm:
+    """weight x norm(residual(states, controls, context)) of one candidate.
+
+    The residual sees states (H', L, 13), controls (H, J, 3) [rad] and the task's `context` (any pytree of
+    arrays), and returns (R,), or (T, R) of which the norm is averaged over its T instants.
+    """
+
+    name: str
+    residual: Residual
+    norm: Norm = quadratic
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        require_weight(self.name, self.weight)
+
+
+def evaluate(
+    terms: Sequence[CostTerm],
+    states: jax.Array,
+    controls: jax.Array,
+    context: Any = None,
+    weights: Mapping[str, jax.Array | float] | None = None,
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Cost of one candidate, states (H', L, 13) under controls (H, J, 3), and each term's weighted share.
+
+    `weights` replaces the terms' own by name. The total is +inf where a state or the sum is not finite: such
+    a candidate is never chosen. The shares are reported as they are.
+    """
+    shares = {}
+    for term in terms:
+        residual = term.residual(states, controls, context)
+        if residual.ndim not in (1, 2):
+            raise ValueError(f"residual of {term.name!r}: got shape {residual.shape}, needs (R,) or (T, R)")
+        shares[term.name] = (weights or {}).get(term.name, term.weight) * jnp.mean(term.norm(residual))
+    total = jnp.sum(jnp.stack(list(shares.values())))
+    finite = jnp.isfinite(total) & jnp.all(jnp.isfinite(states))
+    return jnp.where(finite, total, jnp.inf), shares
+
+
+def require_weight(name: str, weight: float) -> None:
+    """Refuses a weight that is negative or not finite."""
+    if not (np.isfinite(weight) and weight >= 0):
+        raise ValueError(f"weight of {name!r}: got {weight}, needs a finite number >= 0")
+
+
+def _require_width(width: float) -> None:
+    if not (np.isfinite(width) and width > 0):
+        raise ValueError(f"width: got {width}, needs a finite number > 0 for a gradient at zero")

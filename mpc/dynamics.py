@@ -1,0 +1,92 @@
+"""What the planner plans with: anything that rolls a batch of states out under a batch of controls."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+class Dynamics(Protocol):
+    """A model of the scene; the learned simulator and the truth simulator both are one."""
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether JAX can differentiate `rollout`."""
+
+    def rollout(self, state: jax.Array, controls: jax.Array) -> jax.Array:
+        """States (N, H', L, 13) after steps 1 to H' >= H, from state (N, L, 13), controls (N, H, J, 3) [rad].
+
+        Pure, traceable by JAX, and every row independent of the others. A row that diverged holds NaN.
+        """
+
+
+class BatchedTruth(Protocol):
+    """An engine outside JAX; `larp_model.truth.mujoco.Truth` is one."""
+
+    @property
+    def batch(self) -> int:
+        """How many rows N it rolls out side by side: always exactly so many."""
+
+    def rollout(self, states: np.ndarray, controls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """States (N, H, L, 13) from (N, L, 13) under (N, H, J, 3) [rad], and (N,) False where diverged."""
+
+
+@dataclass(frozen=True)
+class MujocoDynamics:
+    """The truth simulator as the planner's model, called back from the compiled planner.
+
+    It has no gradient: the planner refuses gradient steps on it. Diverged rows come back as NaN. Rows are
+    rolled out `truth.batch` at a time, the last time filled up; a few rows for each core waste least.
+    """
+
+    truth: BatchedTruth
+    differentiable = False
+
+    def rollout(self, state: jax.Array, controls: jax.Array) -> jax.Array:
+        """See `Dynamics.rollout`; H' = H."""
+        shape = (*controls.shape[:2], *state.shape[1:])
+        result = jax.ShapeDtypeStruct(shape, jnp.float32)
+        return jax.pure_callback(self._simulate, result, state, controls)
+
+    def _simulate(self, state: jax.Array, controls: jax.Array) -> np.ndarray:
+        start, targets, size = np.asarray(state), np.asarray(controls), self.truth.batch
+        result = np.empty((*targets.shape[:2], *start.shape[1:]), np.float32)
+        for begin in range(0, len(start), size):
+            rows = np.minimum(np.arange(begin, begin + size), len(start) - 1)
+            states, ok = self.truth.rollout(start[rows], targets[rows])
+            result[rows] = np.where(ok[:, None, None, None], states, np.nan)
+        return result
+
+
+@dataclass(frozen=True)
+class Continued:
+    """The whole scene for H steps under control, then only `links` for `steps` more, by their own model.
+
+    A flying ball is followed to its target at a fraction of the whole scene's cost. All other links stay
+    frozen as step H left them. `tail` sees the states of `links` (N, links, 13) and controls (N, steps, 0,
+    3).
+    """
+
+    dynamics: Dynamics
+    tail: Dynamics
+    links: slice
+    steps: int
+
+    def __post_init__(self) -> None:
+        if self.steps < 1:
+            raise ValueError(f"steps: got {self.steps}, needs at least 1")
+
+    @property
+    def differentiable(self) -> bool:
+        """True where both models are differentiable."""
+        return self.dynamics.differentiable and self.tail.differentiable
+
+    def rollout(self, state: jax.Array, controls: jax.Array) -> jax.Array:
+        """See `Dynamics.rollout`; H' = H + steps."""
+        states = self.dynamics.rollout(state, controls)
+        last = states[:, -1]
+        followed = self.tail.rollout(last[:, self.links], jnp.zeros((len(state), self.steps, 0, 3)))
+        frozen = jnp.repeat(last[:, None], self.steps, axis=1)
+        return jnp.concatenate([states, frozen.at[:, :, self.links].set(followed)], axis=1)

@@ -1,0 +1,137 @@
+"""How far from its target the kicked ball really passes: many kicks, executed in MuJoCo."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich.progress import track
+from rich.table import Table
+
+from larp_model import weights as stored
+from tasks.benchmarks import report
+from tasks.data import random_task
+from tasks.kick import PRESETS, WEIGHTS, dynamics_of, planners_of, prepare, remember_compilations, run
+
+WITHIN = (0.1, 0.25, 0.5)
+
+
+def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """The figures of a set of kicks."""
+    truth = np.array([row["truth_error_m"] for row in rows])
+    again = np.array([row["replan_ms"]["p50"] for row in rows])
+    worst = np.array([row["replan_ms"]["p99"] for row in rows])
+    return {
+        "mean_truth_error_m": float(truth.mean()),
+        "median_truth_error_m": float(np.median(truth)),
+        "p90_truth_error_m": float(np.quantile(truth, 0.9)),
+        "success": {str(within): float((truth <= within).mean()) for within in WITHIN},
+        "mean_model_error_m": float(np.mean([row["model_error_m"] for row in rows])),
+        "mean_gap_m": float(np.mean([abs(row["truth_error_m"] - row["model_error_m"]) for row in rows])),
+        "mean_reference_deviation_m": float(np.mean([row["reference_deviation_m"] for row in rows])),
+        "touched": int(sum(row["touched"] for row in rows)),
+        "falls": int(sum(row["fell"] for row in rows)),
+        "mean_plan_seconds": float(np.mean([row["plan_seconds"] for row in rows])),
+        "replan_ms": {"p50": float(np.median(again)), "p99": float(worst.max())},
+        "compile_seconds": float(sum(row["compile_seconds"] for row in rows)),
+        "truth_rollouts": int(sum(row["truth_rollouts"] for row in rows)),
+    }
+
+
+def picture(rows: list[dict[str, Any]], title: str) -> Figure:
+    """Where the targets were and how far each was missed; believed against true."""
+    figure = Figure(figsize=(12, 5), layout="constrained")
+    figure.suptitle(title)
+    above, gap = figure.subplots(1, 2)
+    targets = np.array([row["target"] for row in rows])
+    truth = 100 * np.array([row["truth_error_m"] for row in rows])
+    model = 100 * np.array([row["model_error_m"] for row in rows])
+    points = above.scatter(targets[:, 0], targets[:, 1], c=truth, s=60 + 120 * targets[:, 2], cmap="viridis")
+    figure.colorbar(points, ax=above, label="missed by, in MuJoCo [cm]")
+    above.scatter(0.0, 0.0, marker="+", c="black", s=80)
+    above.set(
+        xlabel="forwards [m]", ylabel="to the left [m]", title="targets from above, larger: higher", aspect="equal"
+    )
+    largest = max(truth.max(), model.max()) * 1.05
+    gap.plot([0, largest], [0, largest], color="0.7", linewidth=1)
+    gap.scatter(model, truth, color="#0072b2")
+    gap.set(
+        xlabel="miss the model expected [cm]", ylabel="miss in MuJoCo [cm]", title="model and truth", aspect="equal"
+    )
+    return figure
+
+
+def main(
+    targets: int = 16,
+    seed: int = 0,
+    preset: str = "balanced",
+    dynamics: str = "larp",
+    json: Path | None = None,
+    weights: Path = stored.SHIPPED / f"{WEIGHTS}.json",
+) -> None:
+    """Plan and execute kicks to random targets.
+
+    Args:
+        targets: how many kicks.
+        seed: of targets, ball spots and planner.
+        preset: fast, balanced or accurate.
+        dynamics: the planner's model: larp or mujoco.
+        json: where the figures go; the picture goes beside them.
+        weights: manifest of the weights of the learned model.
+    """
+    if targets < 1:
+        raise ValueError(f"targets is {targets}, but must be at least 1")
+    if preset not in PRESETS:
+        raise ValueError(f"preset is {preset!r}, but must be one of {', '.join(PRESETS)}")
+    name = f"kick_{preset}_{dynamics}"
+    json = json or Path(f"runs/benchmarks/{name}.json")
+    remember_compilations()
+    kick = prepare()
+    model, used = dynamics_of(kick.scene, dynamics, weights)  # type: ignore[arg-type]
+    first, again, every = planners_of(kick, preset, model)
+    random = np.random.default_rng(seed)
+    rows = []
+    for index in track(range(targets), description="kicks", disable=not sys.stderr.isatty()):
+        target, shift = random_task(random)
+        execution = kick.run((first, again), every, target, seed + index, shift)
+        rows.append(
+            kick.report(execution, target)
+            | {
+                "preset": preset,
+                "dynamics": dynamics,
+                "weights": used,
+                "seed": seed + index,
+                "ball_shift": shift.tolist(),
+            }
+        )
+    figures = summarise(rows)
+    command = (
+        f"python -m tasks.benchmarks.kick --targets {targets} --seed {seed} --preset {preset} --dynamics {dynamics}"
+    )
+    report.write_json(json, {"command": command, "hardware": report.hardware(), **figures, "rows": rows})
+    report.write_picture(json.with_suffix(".png"), picture(rows, f"{targets} kicks, {preset}, {dynamics}"))
+    table = Table("measure", "value", title=f"Kick: {preset}, {dynamics}")
+    for measure, value in (
+        ("mean truth error", f"{figures['mean_truth_error_m']:.3f} m"),
+        ("median, 90th percentile", f"{figures['median_truth_error_m']:.3f} m, {figures['p90_truth_error_m']:.3f} m"),
+        *((f"within {within} m", f"{100 * figures['success'][str(within)]:.0f} %") for within in WITHIN),
+        ("mean model error", f"{figures['mean_model_error_m']:.3f} m"),
+        ("mean gap between truth and model", f"{figures['mean_gap_m']:.3f} m"),
+        ("mean distance from the reference", f"{figures['mean_reference_deviation_m']:.3f} m"),
+        ("ball touched", f"{figures['touched']} of {targets}"),
+        ("fell within 2 s", f"{figures['falls']} of {targets}"),
+        ("first plan", f"{figures['mean_plan_seconds']:.2f} s"),
+        ("replan, p50 and p99", f"{figures['replan_ms']['p50']:.0f} ms, {figures['replan_ms']['p99']:.0f} ms"),
+        ("compilation, once", f"{figures['compile_seconds']:.0f} s"),
+        ("truth rollouts asked for by the planner", str(figures["truth_rollouts"])),
+    ):
+        table.add_row(measure, value)
+    report.show(table)
+    report.publish(name, f"Kick: {preset}, {dynamics}, {targets} targets", command, table)
+
+
+if __name__ == "__main__":
+    run(main)

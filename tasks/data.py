@@ -1,0 +1,136 @@
+"""Truth episodes around the reference kick: what the learned simulator is trained and judged on."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from larp_model import state as packed
+from larp_model.scene import Scene
+from larp_model.truth.episodes import Episodes, record
+from larp_model.truth.mujoco import Truth
+from tasks.references import Reference
+
+STEPS = 70
+# How far random joint targets stray from the reference, standard deviation by segment [rad]; the planner's too.
+STRAY = {
+    "torso": 0.15,
+    "head": 0.05,
+    "upper_arm": 0.15,
+    "lower_arm": 0.10,
+    "thigh": 0.25,
+    "shin": 0.25,
+    "foot": 0.20,
+}
+
+# Kicks that the benchmark asks for: bearing [degrees], distance [m], height [m] of the target; shift of the ball [m].
+BEARING, DISTANCE, HEIGHT, SHIFT = 25.0, (2.0, 5.0), (0.11, 1.0), 0.03
+# Windows over which errors are averaged, as in the paper [steps].
+WINDOWS = (10, 38, 60)
+
+
+def stray(scene: Scene) -> np.ndarray:
+    """`STRAY` of every motor and axis (J, 3) [rad]; none where the motor does not turn."""
+    rows = []
+    for body in scene.bodies:
+        for child, _, motor in body.motors:
+            segment = body.links[child].name.removeprefix("left_").removeprefix("right_")
+            free = np.subtract(motor.upper, motor.lower) > 0.45
+            rows.append(STRAY[segment] * np.where(free, 1.0, 0.2))
+    return np.array(rows)
+
+
+def smooth_noise(random: np.random.Generator, count: int, steps: int, knots: int, scale: np.ndarray) -> np.ndarray:
+    """Random walks (count, steps, J, 3) through `knots` random values of standard deviation `scale` (J, 3)."""
+    values = random.standard_normal((count, knots, *scale.shape)) * scale
+    return CubicSpline(np.linspace(0.0, 1.0, knots), values, axis=1)(np.linspace(0.0, 1.0, steps))
+
+
+def random_starts(
+    random: np.random.Generator, scene: Scene, reference: Reference, count: int, steps: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """States (count, L, 13) along the reference, disturbed and turned about z, and the steps (count,) they come from.
+
+    The ball waits where a foot will pass, or near its spot, or comes from anywhere.
+    """
+    latest = len(reference.controls) - steps - 1
+    from_start = random.random(count) < 0.5
+    begin = np.where(from_start, 0, random.integers(0, min(120, latest), count))
+    states = reference.states[begin].copy()
+    human = len(scene.bodies[0].links)
+    size = np.where(random.random(count) < 0.3, 0.0, random.uniform(0.0, 1.0, count))[:, None, None]
+    tilt = Rotation.from_rotvec((0.06 * size * random.standard_normal((count, human, 3))).reshape(-1, 3))
+    turned = tilt * Rotation.from_quat(states[:, :human, packed.ORIENTATION].reshape(-1, 4), scalar_first=True)
+    states[:, :human, packed.ORIENTATION] = turned.as_quat(scalar_first=True).reshape(count, human, 4)
+    states[:, :human, packed.ANGULAR_VELOCITY] += 1.0 * size * random.standard_normal((count, human, 3))
+    states[:, 0, packed.VELOCITY] += 0.3 * size[:, 0] * random.standard_normal((count, 3))
+    states[:, :human, 2] += 0.02 * size[:, 0] * random.random((count, 1))
+
+    radius = scene.bodies[-1].links[0].radius
+    ball = states[:, -1]
+    ball[:] = 0.0
+    ball[:, 3] = 1.0
+    kind = random.random(count)
+    ball[:, :2] = reference.ball_spot[:2] + random.uniform(-0.06, 0.06, (count, 2))
+    ball[:, 2] = radius
+    foot = scene.index(scene.bodies[0].name, "right_foot")
+    met = np.clip(begin + random.integers(2, steps, count), 0, len(reference.states) - 1)
+    crossing = kind > 0.35
+    place = reference.states[met, foot, :3] + 0.08 * random.standard_normal((count, 3)) + (0.08, 0.0, 0.0)
+    place[:, 2] = np.where(random.random(count) < 0.6, radius, np.maximum(place[:, 2], radius))
+    ball[crossing, :3] = place[crossing]
+    rolling = kind > 0.6
+    motion = random.standard_normal((count, 3)) * (2.0, 2.0, 1.0)
+    ball[rolling, 7:10] = motion[rolling]
+    away = ((met - begin) * scene.dt * random.uniform(0.0, 1.0, count))[:, None] * motion * (1.0, 1.0, 0.0)
+    ball[rolling, :3] -= away[rolling]
+    flying = kind > 0.85
+    ball[flying, 2] += random.uniform(0.0, 1.0, count)[flying]
+    ball[rolling, 10:13] = 8.0 * random.standard_normal((count, 3))[rolling]
+    states[:, -1] = ball
+    states[:, -1, 2] = np.maximum(states[:, -1, 2], radius)
+    return _turn(states, random.uniform(-np.pi, np.pi, count)), begin
+
+
+def _turn(states: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    turn = Rotation.from_rotvec(np.repeat(angle, states.shape[1])[:, None] * (0.0, 0.0, 1.0))
+    shape = (*states.shape[:2], 3)
+    turned = states.copy()
+    for columns in (packed.POSITION, packed.VELOCITY, packed.ANGULAR_VELOCITY):
+        turned[..., columns] = turn.apply(states[..., columns].reshape(-1, 3)).reshape(shape)
+    orientation = Rotation.from_quat(states[..., packed.ORIENTATION].reshape(-1, 4), scalar_first=True)
+    turned[..., packed.ORIENTATION] = (turn * orientation).as_quat(scalar_first=True).reshape(*states.shape[:2], 4)
+    return turned
+
+
+def random_episodes(
+    scene: Scene, reference: Reference, count: int, seed: int, steps: int = STEPS
+) -> tuple[Episodes, int]:
+    """Episodes from `random_starts` under the reference's targets plus smooth noise; some with pushes from outside.
+
+    Returns them and how many diverged and were dropped.
+    """
+    random = np.random.default_rng(seed)
+    states, begin = random_starts(random, scene, reference, count, steps)
+    rows = np.minimum(begin[:, None] + np.arange(steps), len(reference.controls) - 1)
+    size = random.uniform(0.0, 1.2, (count, 1, 1, 1))
+    controls = reference.controls[rows] + size * smooth_noise(random, count, steps, 8, stray(scene))
+    lower = np.array([motor.lower for motor in scene.motors])
+    upper = np.array([motor.upper for motor in scene.motors])
+    controls = np.clip(controls, lower, upper)
+    torques = np.zeros((count, steps, len(scene.links), 3))
+    pushed = np.flatnonzero(random.random(count) < 0.1)
+    human = len(scene.bodies[0].links)
+    torques[pushed, :10, :human] = 4.0 * random.standard_normal((len(pushed), 1, human, 3))
+    return record(Truth(scene, batch=min(count, 256)), states, controls, torques)
+
+
+def random_task(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A target (3,) [m] and a shift of the ball (2,) [m], as `tasks.benchmarks.kick` draws them."""
+    bearing = np.radians(random.uniform(-BEARING, BEARING))
+    distance, height = random.uniform(*DISTANCE), random.uniform(*HEIGHT)
+    return (
+        np.array([distance * np.cos(bearing), distance * np.sin(bearing), height]),
+        random.uniform(-SHIFT, SHIFT, 2),
+    )

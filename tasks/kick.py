@@ -1,0 +1,407 @@
+"""Kick a ball to a target.
+
+    minimise over theta   w_t |x_b(t*) - p|                     the ball's path passes the target p
+                        + w_r mean_t |x_i(t) - x_i^ref(t)|^2    links stay near the reference, root-aligned
+                        + w_e mean_t |Q(t) - Q^ref(t)|^2        joint targets stay near the reference's
+                        + w_u mean_t max(0, h - z_pelvis(t))^2  the pelvis stays up
+                        + w_f min_t |x_f(t) - x_b(t)|^2         the foot finds the ball
+    subject to            S_{t+1} = dynamics(S_t, Q_t),  Q = Q^ref + spline(theta)
+
+t* is the moment at which the ball is nearest to p, between steps too. The dynamics are LARP or MuJoCo; the plan is
+executed in MuJoCo.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from jax import Array
+from rich.console import Console
+from rich.table import Table
+
+from larp_model import state as packed
+from larp_model import weights as stored
+from larp_model.bodies import human_and_ball, standing_height
+from larp_model.scene import Scene
+from larp_model.simulator import Simulator
+from larp_model.truth.mujoco import Truth
+from mpc import CEM, Continued, CostTerm, Dynamics, Gradient, MujocoDynamics, Planner, l2, quadratic
+from mpc.loop import Execution, Window, execute
+from tasks import references
+from tasks.data import stray
+from tasks.references import Reference
+from viewer import LivePage, Recording, kick_picture, nearest_approach, write_html
+from viewer.recording import write_whole
+
+HORIZON = 60
+FLIGHT = 110
+KNOTS = 9
+AFTER_CONTACT = 200
+REACHABLE = 0.25
+WEIGHTS = "human_ball"
+# Rows that MuJoCo, as the planner's model, rolls out side by side.
+ROWS = 32
+
+DynamicsName = Literal["larp", "mujoco"]
+
+
+@dataclass(frozen=True)
+class Preset:
+    """How much a plan may cost: the optimisers of the first plan and of each replan, and steps between replans."""
+
+    first: tuple[CEM | Gradient, ...]
+    again: tuple[CEM | Gradient, ...]
+    every: int
+
+
+PRESETS = {
+    "fast": Preset(
+        (CEM(samples=96, rounds=5, elites=16),),
+        (CEM(samples=64, rounds=1, elites=16),),
+        every=5,
+    ),
+    "balanced": Preset(
+        (CEM(samples=256, rounds=8, elites=24), Gradient(steps=8, elites=16)),
+        (CEM(samples=128, rounds=2, elites=24), Gradient(steps=2, elites=8)),
+        every=4,
+    ),
+    "accurate": Preset(
+        (CEM(samples=512, rounds=12, elites=32), Gradient(steps=16, elites=32)),
+        (CEM(samples=256, rounds=3, elites=32), Gradient(steps=4, elites=16)),
+        every=3,
+    ),
+}
+
+
+def ball_distance(path: Array, target: Array) -> Array:
+    """Vector (3,) from the target to the nearest point of the ball's path (T, 3), straight between steps."""
+    start, along = path[:-1], path[1:] - path[:-1]
+    share = jnp.sum((target - start) * along, axis=-1) / (jnp.sum(along**2, axis=-1) + 1e-9)
+    nearest = start + jnp.clip(share, 0.0, 1.0)[:, None] * along
+    squared = jnp.sum((nearest - target) ** 2, axis=-1)
+    return nearest[jnp.argmin(squared)] - target
+
+
+class Kick:
+    """The kick task on one scene and reference: terms, windows, planners, execution and its report."""
+
+    def __init__(self, scene: Scene, reference: Reference) -> None:
+        """scene: its first body is the human, its last the ball."""
+        self.scene, self.reference = scene, reference
+        self.human = scene.rows(scene.bodies[0].name)
+        self.ball = len(scene.links) - 1
+        self.foot = scene.index(scene.bodies[0].name, "right_foot")
+        self.standing = standing_height(scene.bodies[0])
+        bounds = np.array([(motor.lower, motor.upper) for motor in scene.motors])
+        self.lower, self.upper = bounds[:, 0], bounds[:, 1]
+
+    @property
+    def terms(self) -> tuple[CostTerm, ...]:
+        """The named costs of a candidate."""
+
+        def target(states: Array, controls: Array, context: Any) -> Array:
+            return ball_distance(states[:, self.ball, packed.POSITION], context["target"])
+
+        def near_reference(states: Array, controls: Array, context: Any) -> Array:
+            links = states[: len(controls), self.human, packed.POSITION]
+            links = links - links[:, :1]
+            return ((links - context["reference"]) * context["until_strike"][:, None, None]).reshape(len(controls), -1)
+
+        def effort(states: Array, controls: Array, context: Any) -> Array:
+            return (controls - context["controls"]).reshape(len(controls), -1)
+
+        def upright(states: Array, controls: Array, context: Any) -> Array:
+            return jnp.maximum(0.85 * self.standing - states[: len(controls), 0, 2:3], 0.0)
+
+        def find_ball(states: Array, controls: Array, context: Any) -> Array:
+            apart = (
+                states[: len(controls), self.foot, packed.POSITION]
+                - states[: len(controls), self.ball, packed.POSITION]
+            )
+            return apart[jnp.argmin(jnp.sum(apart**2, axis=-1))]
+
+        return (
+            CostTerm("target", target, l2(0.05), 10.0),
+            CostTerm("reference", near_reference, quadratic, 1.0),
+            CostTerm("effort", effort, quadratic, 0.1),
+            CostTerm("upright", upright, quadratic, 20.0),
+            CostTerm("find_ball", find_ball, quadratic, 5.0),
+        )
+
+    def window(self, target: np.ndarray) -> Callable[[int], Window]:
+        """The reference's window from any step on, with the target (3,) [m], as the residuals' context."""
+
+        def at(step: int) -> Window:
+            states, controls = self.reference.window(step, HORIZON)
+            links = states[:, self.human, packed.POSITION]
+            context = {
+                "target": np.asarray(target, float),
+                "reference": links - links[:, :1],
+                "controls": controls,
+                "until_strike": (np.arange(step + 1, step + 1 + HORIZON) <= self.reference.strike + 5).astype(float),
+            }
+            return Window(controls, context)
+
+        return at
+
+    def planner(self, dynamics: Dynamics, optimizers: tuple[CEM | Gradient, ...]) -> Planner:
+        """A planner of this task; gradient steps are left out where the dynamics have no gradient."""
+        usable = [each for each in optimizers if dynamics.differentiable or isinstance(each, CEM)]
+        return Planner(
+            dynamics, self.terms, HORIZON, KNOTS, self.scene.dt, stray(self.scene), usable, self.lower, self.upper
+        )
+
+    def start(self, ball_offset: np.ndarray | tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+        """The state (L, 13) before the kick, the ball moved by an offset (2,) [m] along the ground."""
+        state = self.reference.states[0].copy()
+        state[self.ball, :2] += ball_offset
+        return state
+
+    def run(
+        self,
+        planners: tuple[Planner, Planner],
+        every: int,
+        target: np.ndarray,
+        seed: int,
+        ball_offset: np.ndarray | tuple[float, float] = (0.0, 0.0),
+        steps: int | None = None,
+        observe: Callable[[Execution], None] = lambda execution: None,
+    ) -> Execution:
+        """Plan and execute one kick in the truth, for `steps` or until 2 s after contact."""
+        state = self.start(ball_offset)
+        spot = state[self.ball, :3]
+
+        def untouched(current: np.ndarray) -> bool:
+            return bool(
+                np.linalg.norm(current[self.ball, packed.VELOCITY]) < 0.5
+                and abs(current[self.ball, :3] - spot).max() < 0.02
+            )
+
+        return execute(
+            Truth(self.scene, threads=1),
+            state,
+            *planners,
+            window=self.window(target),
+            steps=self.reference.strike + 20 + AFTER_CONTACT if steps is None else steps,
+            every=every,
+            keep_planning=untouched,
+            key=jax.random.key(seed),
+            dt=self.scene.dt,
+            observe=observe,
+        )
+
+    def contact_step(self, states: np.ndarray) -> int | None:
+        """The first step after which the ball (T + 1, L, 13) moves, or None."""
+        moving = np.linalg.norm(states[:, self.ball, packed.VELOCITY], axis=-1) > 0.3
+        return int(moving.argmax()) if moving.any() else None
+
+    def report(self, execution: Execution, target: np.ndarray) -> dict[str, Any]:
+        """What `summary.json` says of the kick itself; see the README for each entry."""
+        states = np.stack(execution.states)
+        contact = self.contact_step(states)
+        begin = 0 if contact is None else max(contact - 1, 0)
+        end = len(states) if contact is None else min(contact + AFTER_CONTACT + 1, len(states))
+        last = execution.replans[-1]
+        links = states[: begin + 1, self.human, packed.POSITION]
+        wanted = self.reference.states[: begin + 1, self.human, packed.POSITION]
+        apart = np.linalg.norm((links - links[:, :1]) - (wanted - wanted[:, :1]), axis=-1)
+        model_error = miss(last.info.states[:, self.ball, packed.POSITION], target)
+        seconds = [replan.info.seconds for replan in execution.replans]
+        again = 1e3 * np.array(seconds[1:] or seconds)
+        return {
+            "target": [float(x) for x in target],
+            "truth_error_m": miss(states[begin:end, self.ball, packed.POSITION], target),
+            "model_error_m": model_error,
+            "reference_deviation_m": float(apart.mean()),
+            "ball_speed_m_s": float(np.linalg.norm(states[begin:end, self.ball, packed.VELOCITY], axis=-1).max()),
+            "touched": contact is not None,
+            "fell": bool((states[:end, 0, 2] < 0.5 * self.standing).any()),
+            "reachable": model_error <= REACHABLE,
+            "plan_seconds": float(seconds[0]),
+            "replan_ms": {"p50": float(np.quantile(again, 0.5)), "p99": float(np.quantile(again, 0.99))},
+            "compile_seconds": float(sum(replan.info.compile_seconds for replan in execution.replans)),
+            "candidates_lost": sum(r.info.candidates - r.info.finite for r in execution.replans),
+            "truth_rollouts": 0,
+        }
+
+
+def miss(path: np.ndarray, target: np.ndarray) -> float:
+    """Smallest distance [m] of the ball's path (T, 3) from the target (3,)."""
+    return nearest_approach(path, target).distance
+
+
+def dynamics_of(scene: Scene, name: DynamicsName, weights: Path) -> tuple[Dynamics, str]:
+    """The planner's model, followed by the ball alone once no link can reach it any more, and what weights it has."""
+    human, ball = scene.bodies[0].name, scene.bodies[-1].name
+    alone = scene.only(ball)
+    whole: Dynamics
+    tail: Dynamics
+    if name == "larp":
+        config, learned, manifest = stored.load(weights, scene)
+        whole, tail = Simulator(scene, config, learned), Simulator(alone, config, learned)
+        used = manifest["sha256"][:12]
+    elif name == "mujoco":
+        whole, tail = MujocoDynamics(Truth(scene, ROWS)), MujocoDynamics(Truth(alone, ROWS))
+        used = "none"
+    else:
+        raise ValueError(f"dynamics is {name!r}, but must be 'larp' or 'mujoco'")
+    return Continued(whole, tail, slice(scene.rows(human).stop, None), FLIGHT), used
+
+
+def planners_of(kick: Kick, preset: str, dynamics: Dynamics) -> tuple[Planner, Planner, int]:
+    """The preset's planners for the first plan and for replans, and the steps between replans."""
+    if preset not in PRESETS:
+        raise ValueError(f"preset is {preset!r}, but must be one of {', '.join(PRESETS)}")
+    chosen = PRESETS[preset]
+    return kick.planner(dynamics, chosen.first), kick.planner(dynamics, chosen.again), chosen.every
+
+
+def checked_target(target: tuple[float, ...]) -> np.ndarray:
+    """The target (3,) [m]; refuses what is not three finite numbers."""
+    if len(target) != 3 or not np.isfinite(target).all():
+        raise ValueError(f"target is {target}, but must be three finite numbers, in metres")
+    return np.asarray(target, float)
+
+
+def remember_compilations() -> None:
+    """Keep compiled planners in the user's cache folder, so that the second run starts at once."""
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    jax.config.update("jax_compilation_cache_dir", str(base / "larp-mpc"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def recording_of(kick: Kick, execution: Execution, target: np.ndarray, summary: dict[str, Any]) -> Recording:
+    """The kick for the viewer: the truth, the last plan's prediction, the reference."""
+    last = execution.replans[-1]
+    states = np.stack(execution.states)
+    predicted = np.concatenate([states[last.step : last.step + 1], last.info.states])
+    shown = {
+        "passed the target at": f"{100 * summary['truth_error_m']:.1f} cm",
+        "the model expected": f"{100 * summary['model_error_m']:.1f} cm",
+        "ball speed": f"{summary['ball_speed_m_s']:.1f} m/s",
+        "dynamics": f"{summary['dynamics']}, {summary['preset']}",
+    }
+    title = "Kick to ({:.2f}, {:.2f}, {:.2f}) m".format(*target)
+    reference = kick.reference.states[: len(states)]
+    return Recording(kick.scene, states, target, predicted, last.step, reference, title, shown)
+
+
+def write(folder: Path, kick: Kick, execution: Execution, target: np.ndarray, summary: dict[str, Any]) -> None:
+    """`kick.npz`, `kick.png`, `kick.html` and, last, `summary.json`; each whole or not at all."""
+    recording = recording_of(kick, execution, target, summary)
+    last = execution.replans[-1]
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        states=recording.states.astype(np.float32),
+        joint_targets=np.stack(execution.controls).astype(np.float32),
+        plan_knots=np.asarray(last.plan.knots),
+        plan_step=last.step,
+        predicted_states=last.info.states,
+    )
+    write_whole(folder / "kick.npz", buffer.getvalue())
+    costs = {name: [replan.info.terms[name] for replan in execution.replans] for name in last.info.terms}
+    kick_picture(recording, costs, folder / "kick.png")
+    write_html(recording, folder / "kick.html")
+    write_whole(folder / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())
+
+
+def table(summary: dict[str, Any]) -> Table:
+    """The result for a person."""
+    rows = Table("", "", title="Kick", show_header=False)
+    x, y, z = summary["target"]
+    rows.add_row("target", f"({x:.2f}, {y:.2f}, {z:.2f}) m")
+    rows.add_row("missed by, in MuJoCo", f"{100 * summary['truth_error_m']:.1f} cm")
+    rows.add_row("missed by, as the model expected", f"{100 * summary['model_error_m']:.1f} cm")
+    rows.add_row("distance from the reference", f"{100 * summary['reference_deviation_m']:.1f} cm")
+    rows.add_row("ball speed", f"{summary['ball_speed_m_s']:.1f} m/s")
+    rows.add_row("fell", "yes" if summary["fell"] else "no")
+    rows.add_row("first plan, each replan", f"{summary['plan_seconds']:.2f} s, {summary['replan_ms']['p50']:.0f} ms")
+    rows.add_row("compilation", f"{summary['compile_seconds']:.1f} s")
+    if not summary["reachable"]:
+        rows.add_row("reachable", "no: this plan comes nearest")
+    return rows
+
+
+def prepare(body_reference: Path | None = None) -> Kick:
+    """The kick's scene with its reference: the embedded one, or a captured one from a BVH file."""
+    scene = human_and_ball()
+    reference = references.embedded(scene) if body_reference is None else references.captured(body_reference, scene)
+    return Kick(scene, reference)
+
+
+def main(
+    target: tuple[float, float, float] = (4.0, 0.0, 0.5),
+    preset: str = "balanced",
+    dynamics: str = "larp",
+    reference: Path | None = None,
+    weights: Path = stored.SHIPPED / f"{WEIGHTS}.json",
+    seed: int = 0,
+    out: Path = Path("runs/kick"),
+    view: bool = False,
+    port: int = 8080,
+) -> None:
+    """Plan a kick, execute it in MuJoCo, show how far the ball passed from its target.
+
+    Args:
+        target: where the ball's centre should pass [m]: forwards, to the left, up.
+        preset: fast, balanced or accurate.
+        dynamics: the planner's model: larp (learned) or mujoco.
+        reference: a captured kick (BVH) instead of the embedded one.
+        weights: manifest of the weights of the learned model.
+        seed: of the planner's random numbers.
+        out: folder for summary.json, kick.npz, kick.png and kick.html.
+        view: show the kick live in the browser, on 127.0.0.1.
+        port: of the page.
+    """
+    goal = checked_target(target)
+    if reference is not None and not reference.is_file():
+        raise ValueError(f"reference is {str(reference)!r}, but no such file exists")
+    if preset not in PRESETS:
+        raise ValueError(f"preset is {preset!r}, but must be one of {', '.join(PRESETS)}")
+    remember_compilations()
+    kick = prepare(reference)
+    model, used = dynamics_of(kick.scene, dynamics, weights)  # type: ignore[arg-type]
+    first, again, every = planners_of(kick, preset, model)
+    page = LivePage(port=port) if view else None
+    if page:
+        page.begin(kick.scene, goal)
+
+    def observe(execution: Execution) -> None:
+        if page:
+            last, step = execution.replans[-1], len(execution.states) - 1
+            news = last.info.states[1:] if last.step == step - 1 else None
+            page.update(execution.states[-1], news, step * kick.scene.dt)
+
+    execution = kick.run((first, again), every, goal, seed, observe=observe)
+    summary = kick.report(execution, goal) | {"preset": preset, "dynamics": dynamics, "weights": used, "seed": seed}
+    write(out, kick, execution, goal, summary)
+    Console().print(table(summary))
+    Console().print(f"{out}/: summary.json, kick.npz, kick.png, kick.html")
+    if page:
+        page.finish(recording_of(kick, execution, goal, summary))
+        page.wait()
+
+
+def run(task: Callable[..., None]) -> None:
+    """A task's command line: wrong values end it with one line and exit code 2."""
+    try:
+        tyro.cli(task)
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,10 @@
+"""Kick the ball to the left."""
+
+from functools import partial
+
+from tasks import kick
+
+TARGET = (4.0, 1.2, 0.5)
+
+if __name__ == "__main__":
+    kick.run(partial(kick.main, target=TARGET))

@@ -1,0 +1,199 @@
+"""The layout of the project: imports point one way, importing does nothing, and data is never executed."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+# A module imports only from modules listed before it, so a new file goes below all that it imports.
+# A package's own name is its __init__.py, which re-exports what stands above.
+ORDER = [
+    "larp_model.scene",
+    "larp_model.bodies",
+    "larp_model.state",
+    "larp_model.rotation",
+    "larp_model.contact",
+    "larp_model.features",
+    "larp_model.networks",
+    "larp_model.simulator",
+    "larp_model.losses",
+    "larp_model.training",
+    "larp_model.evaluation",
+    "larp_model.weights",
+    "larp_model.truth.mujoco",
+    "larp_model.truth.bullet",
+    "larp_model.truth.episodes",
+    "larp_model.truth",
+    "larp_model",
+    "mpc.dynamics",
+    "mpc.spline",
+    "mpc.cost",
+    "mpc.search",
+    "mpc.cem",
+    "mpc.gradient",
+    "mpc.planner",
+    "mpc.loop",
+    "mpc",
+    "viewer.recording",
+    "viewer.scene_view",
+    "viewer.stage",
+    "viewer.panel",
+    "viewer.app",
+    "viewer.replay",
+    "viewer.picture",
+    "viewer",
+    "tasks.key_poses",
+    "tasks.bvh",
+    "tasks.references",
+    "tasks.data",
+    "tasks.kick",
+    "tasks.kick_left",
+    "tasks.kick_straight",
+    "tasks.kick_right",
+    "tasks.train",
+    "tasks.benchmarks.report",
+    "tasks.benchmarks.kick",
+    "tasks.benchmarks.model",
+    "tasks.benchmarks.reference",
+    "tasks.benchmarks.speed",
+    "tasks.benchmarks.tradeoff",
+    "tasks.benchmarks.stability",
+    "tasks.benchmarks",
+    "tasks",
+]
+PACKAGES = ("larp_model", "mpc", "viewer", "tasks")
+FILES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
+TESTS = sorted((ROOT / "tests").glob("*.py"))
+EXECUTING_LOADERS = {"cloudpickle", "dill", "joblib", "marshal", "pickle", "shelve"}
+
+
+def module_name(path: Path) -> str:
+    """Dotted name of a file of the project; a package's `__init__.py` has the name of the package."""
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+def imports(tree: ast.AST, package: str) -> Iterator[tuple[int, str]]:
+    """Line and absolute name of everything imported anywhere in a file of `package`.
+
+    `from a import b` yields a.b where that is a module of this project, and a where b is a name in a.
+    """
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            parents = package.split(".")[: len(package.split(".")) + 1 - node.level] if node.level else []
+            source = ".".join([*parents, *([node.module] if node.module else [])])
+            for alias in node.names:
+                inner = f"{source}.{alias.name}"
+                yield node.lineno, inner if inner in ORDER else source
+
+
+def effects(statements: list[ast.stmt]) -> Iterator[ast.stmt]:
+    """Statements of a module's top level that do more than import, define and name things."""
+    for statement in statements:
+        match statement:
+            case ast.Import() | ast.ImportFrom() | ast.Expr(ast.Constant()):
+                pass
+            case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
+                pass
+            case ast.Assign(targets=[ast.Name() | ast.Tuple()]) | ast.AnnAssign(target=ast.Name()):
+                pass
+            case ast.If(test=ast.Compare(left=ast.Name("__name__"))):
+                pass
+            case ast.If():
+                yield from effects([*statement.body, *statement.orelse])
+            case ast.Try():
+                handlers = [inner for handler in statement.handlers for inner in handler.body]
+                yield from effects([*statement.body, *handlers, *statement.orelse, *statement.finalbody])
+            case _:
+                yield statement
+
+
+def executing_loads(tree: ast.AST) -> Iterator[int]:
+    """Lines that could run code found in a data file: pickle and its kin, or `numpy.load` allowed to."""
+    for line, name in imports(tree, ""):
+        if name.split(".")[0] in EXECUTING_LOADERS:
+            yield line
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            allowed = [word.value for word in node.keywords if word.arg == "allow_pickle"]
+            if ast.unparse(node.func) in ("np.load", "numpy.load"):
+                allowed += node.args[2:3]
+            if any(not (isinstance(value, ast.Constant) and value.value is False) for value in allowed):
+                yield node.lineno
+
+
+def parse(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+
+
+@pytest.mark.parametrize("path", FILES, ids=module_name)
+def test_imports_point_upwards(path: Path) -> None:
+    name = module_name(path)
+    assert name in ORDER, f"list {name} in ORDER in tests/{Path(__file__).name}, below all that it imports"
+    package = name if path.stem == "__init__" else name.rpartition(".")[0]
+    allowed = ORDER[: ORDER.index(name)]
+    wrong = [
+        f"line {line} imports {imported}"
+        for line, imported in dict.fromkeys(imports(parse(path), package))
+        if imported.split(".")[0] in PACKAGES and imported not in allowed
+    ]
+    assert not wrong, f"{name} may import only from modules listed before it in ORDER:\n" + "\n".join(wrong)
+
+
+@pytest.mark.parametrize("path", FILES, ids=module_name)
+def test_importing_does_nothing(path: Path) -> None:
+    found = [f"line {statement.lineno}: {ast.unparse(statement)}" for statement in effects(parse(path).body)]
+    assert not found, f"{module_name(path)} acts when imported:\n" + "\n".join(found)
+
+
+@pytest.mark.parametrize("path", FILES + TESTS, ids=module_name)
+def test_data_is_never_executed(path: Path) -> None:
+    lines = list(executing_loads(parse(path)))
+    assert not lines, f"{module_name(path)} may run code from a data file at lines {lines}"
+
+
+@pytest.mark.parametrize(
+    ("source", "package", "expected"),
+    [
+        ("import mpc.cost", "tasks", "mpc.cost"),
+        ("def late():\n    from mpc import cost", "tasks", "mpc.cost"),
+        ("from mpc import CostTerm", "tasks", "mpc"),
+        ("from mpc.cost import CostTerm", "tasks", "mpc.cost"),
+        ("from . import spline", "mpc", "mpc.spline"),
+        ("from .spline import shift", "mpc", "mpc.spline"),
+        ("from ..scene import Scene", "larp_model.truth", "larp_model.scene"),
+    ],
+)
+def test_imports_are_found(source: str, package: str, expected: str) -> None:
+    assert [name for _, name in imports(ast.parse(source), package)] == [expected]
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "jax.config.update('jax_enable_x64', True)",
+        "os.environ['XLA_FLAGS'] = ''",
+        "if flag:\n    print('hello')",
+        "try:\n    import warp\nexcept ImportError:\n    print('no warp')",
+        "for name in names:\n    register(name)",
+    ],
+)
+def test_effects_are_found(source: str) -> None:
+    assert list(effects(ast.parse(source).body))
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import pickle",
+        "from pickle import loads",
+        "np.load(file, allow_pickle=True)",
+        "np.load(file, None, flag)",
+    ],
+)
+def test_executing_loads_are_found(source: str) -> None:
+    assert list(executing_loads(ast.parse(source)))

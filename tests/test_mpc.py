@@ -1,0 +1,413 @@
+"""Laws of the planner's parts, and one contract that every planner keeps on every small problem."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mpc import (
+    CEM,
+    Continued,
+    CostTerm,
+    Gradient,
+    MujocoDynamics,
+    Planner,
+    absolute,
+    evaluate,
+    interpolate,
+    l2,
+    quadratic,
+    shift,
+)
+from mpc.search import Search, coloured_noise
+
+HORIZON, KNOTS, DT = 12, 4, 0.01
+KINDS = ("linear", "cubic")
+TIMES = jnp.linspace(0.0, 0.9, KNOTS)
+
+
+# Small problems: one link, one motor whose target is read as a velocity or an acceleration.
+
+
+@dataclass(frozen=True)
+class PointMass:
+    """Moves with the velocity 100 u."""
+
+    differentiable = True
+
+    def rollout(self, state: jax.Array, controls: jax.Array) -> jax.Array:
+        return _moving(state, jnp.cumsum(controls[:, :, 0] * 100 * DT, axis=1))
+
+
+@dataclass(frozen=True)
+class Wall:
+    """Moves with the acceleration 2000 u and is lost (NaN) once past x = 0.5."""
+
+    differentiable = True
+
+    def rollout(self, state: jax.Array, controls: jax.Array) -> jax.Array:
+        velocity = jnp.cumsum(controls[:, :, 0] * 2000 * DT, axis=1)
+        states = _moving(state, jnp.cumsum(velocity * DT, axis=1))
+        lost = jnp.cumsum(states[..., 0, 0] > 0.5, axis=1) > 0
+        return jnp.where(lost[:, :, None, None], jnp.nan, states)
+
+
+@dataclass(frozen=True)
+class Broken:
+    """Always diverges."""
+
+    differentiable = True
+
+    def rollout(self, state: jax.Array, controls: jax.Array) -> jax.Array:
+        return jnp.full((*controls.shape[:2], *state.shape[1:]), jnp.nan)
+
+
+@dataclass(frozen=True)
+class Engine:
+    """A point mass outside JAX that loses every row whose first target is above 0.1."""
+
+    batch: int = 5
+
+    def rollout(self, states: np.ndarray, controls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        assert len(states) == len(controls) == self.batch
+        result = np.repeat(states[:, None], controls.shape[1], axis=1)
+        result[..., :3] += np.cumsum(controls * 100 * DT, axis=1)
+        return result, controls[:, 0, 0, 0] <= 0.1
+
+
+def _moving(state: jax.Array, displacement: jax.Array) -> jax.Array:
+    """States (N, H, L, 13): the first state with every link displaced (N, H, 3)."""
+    states = jnp.repeat(state[:, None], displacement.shape[1], axis=1)
+    return states.at[..., :3].add(displacement[:, :, None])
+
+
+def _miss(states: jax.Array, controls: jax.Array, target: Any) -> jax.Array:
+    """From the target at the end [m]; a lost link is, treacherously, right on it."""
+    distance = states[-1, 0, :3] - target
+    return jnp.where(jnp.abs(distance) < 1e6, distance, 0.0)
+
+
+def _effort(states: jax.Array, controls: jax.Array, target: Any) -> jax.Array:
+    return controls[:, 0]
+
+
+TERMS = (CostTerm("miss", _miss), CostTerm("effort", _effort, quadratic, 1e-3))
+STATE = np.eye(1, 13, 3)
+REFERENCE = np.zeros((HORIZON, 1, 3))
+TARGET = np.array([1.0, -0.5, 0.3])
+PROBLEMS = {"point_mass": PointMass(), "wall": Wall(), "broken": Broken()}
+OPTIMIZERS: dict[str, Any] = {
+    "cem": CEM(samples=32, rounds=4, elites=6),
+    "gradient": Gradient(steps=6, learning_rate=0.2, elites=4),
+    "cem_gradient": (CEM(samples=32, rounds=2, elites=6), Gradient(steps=4, elites=3)),
+    "gradient_cem": (Gradient(steps=2, elites=3), CEM(samples=24, rounds=2, elites=5, decay=1.0)),
+}
+
+
+def _planner(dynamics: Any = None, optimizers: Any = OPTIMIZERS["cem"], **changes: Any) -> Planner:
+    arguments = {"spread": np.full((1, 3), 0.1), "lower": -0.5, "upper": 0.5, **changes}
+    return Planner(dynamics or PointMass(), TERMS, HORIZON, KNOTS, DT, optimizers=optimizers, **arguments)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quick_compilation() -> Iterator[None]:
+    """These problems take longer to compile than to solve."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.mark.parametrize("optimizers", OPTIMIZERS)
+@pytest.mark.parametrize("problem", PROBLEMS)
+def test_every_planner_keeps_the_contract(problem: str, optimizers: str) -> None:
+    planner = _planner(PROBLEMS[problem], OPTIMIZERS[optimizers])
+    first = planner.init(jax.random.key(7))
+    plan, info = planner.step(first, STATE, REFERENCE, TARGET)
+    again, same = planner.step(first, STATE, REFERENCE, TARGET)
+
+    assert plan.knots.shape == (KNOTS, 1, 3) and info.states.shape == (HORIZON, 1, 13)
+    assert jax.tree.map(jnp.shape, plan) == jax.tree.map(jnp.shape, first)
+    assert np.isfinite(plan.elites).all() and np.isfinite(plan.spread).all()
+    assert info.candidates == sum(len(costs) for costs in info.costs)
+    assert info.finite == sum(np.isfinite(costs).sum() for costs in info.costs)
+    assert info.compile_seconds > 0 and same.compile_seconds == 0 and same.seconds > 0
+    assert (plan.knots == again.knots).all() and info.cost == same.cost
+
+    controls = np.asarray(planner.controls(plan, REFERENCE))
+    assert controls.shape == REFERENCE.shape and np.abs(controls).max() <= 0.5
+    if problem == "broken":
+        assert info.finite == 0 and info.cost == np.inf
+        assert (plan.elites == first.knots).all()
+        return
+    zero, _ = evaluate(TERMS, jnp.repeat(STATE[None], HORIZON, axis=0), jnp.asarray(REFERENCE), TARGET)
+    assert info.cost < 0.7 * zero and info.cost == min(costs.min() for costs in info.costs)
+    assert np.isfinite(info.states).all()
+    assert (info.finite < info.candidates) == (problem == "wall")
+    assert sum(info.terms.values()) == pytest.approx(info.cost, rel=1e-5)
+    expected = planner.dynamics.rollout(jnp.asarray(STATE)[None], jnp.asarray(controls)[None])[0]
+    np.testing.assert_allclose(info.states, expected, atol=1e-5)
+
+    onward, later = planner.step(plan, STATE, REFERENCE, TARGET)
+    assert later.cost <= info.cost
+    assert (onward.key != plan.key).all()
+
+
+def test_target_weights_and_time_compile_nothing_again() -> None:
+    planner = _planner()
+    plan = planner.init(jax.random.key(0), now=1.0)
+    assert planner.compile(STATE, REFERENCE, TARGET) > 0
+    plan, info = planner.step(plan, STATE, REFERENCE, TARGET, {"effort": 0}, now=1.0)
+    assert info.terms["effort"] == 0
+    single = STATE.astype(np.float32)
+    other, info = planner.step(plan, single, REFERENCE + 0.01, -TARGET, {"miss": 2.5}, now=1.02)
+    assert info.compile_seconds == 0 and float(other.start) == pytest.approx(1.02)
+    assert planner.step(other, STATE, REFERENCE, TARGET, now=7)[1].compile_seconds == 0
+
+
+def test_locked_axis_never_moves() -> None:
+    spread = [[0.1, 0.0, 0.1]]
+    planner = _planner(optimizers=OPTIMIZERS["cem_gradient"], spread=spread, interpolation="linear")
+    plan, _ = planner.step(planner.init(jax.random.key(0)), STATE, REFERENCE, TARGET)
+    assert (plan.elites[..., 1] == 0).all() and (plan.knots[..., 0] != 0).all()
+
+
+def test_wrong_arguments_are_refused_by_name() -> None:
+    planner = _planner()
+    plan = planner.init(jax.random.key(0), now=1.0)
+    step = {"plan": plan, "state": STATE, "reference": REFERENCE, "context": TARGET, "now": 1.0}
+    other = _planner(optimizers=CEM(samples=32, elites=7)).init(jax.random.key(0))
+    wrong_steps: list[dict[str, Any]] = [
+        {"state": STATE[0]},
+        {"state": STATE * np.nan},
+        {"reference": REFERENCE[1:]},
+        {"now": 0.5},
+        {"now": np.nan},
+        {"plan": other},
+        {"weights": {"mis": 1.0}},
+        {"weights": {"miss": np.nan}},
+    ]
+    for wrong in wrong_steps:
+        with pytest.raises(ValueError, match=next(iter(wrong)).removesuffix("s")):
+            planner.step(**{**step, **wrong})
+    wrong_planners: list[dict[str, Any]] = [
+        {"spread": [0.1, 0.1, 0.1]},
+        {"spread": [[0.1, np.nan, 0.1]]},
+        {"lower": 0.6},
+        {"upper": np.zeros((2, 3))},
+        {"optimizers": ()},
+        {"optimizers": Gradient(), "dynamics": MujocoDynamics(Engine())},
+        {"optimizers": (CEM(samples=8, elites=2), Gradient(elites=5))},
+        {"interpolation": "quintic"},
+        {"reheat": -1.0},
+    ]
+    for wrong in wrong_planners:
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            _planner(**wrong)
+    for name, value in {"horizon": 1, "knots": 13, "dt": 0.0, "terms": TERMS[:1] * 2}.items():
+        arguments: dict[str, Any] = {"terms": TERMS, "horizon": HORIZON, "knots": KNOTS, "dt": DT}
+        with pytest.raises(ValueError, match=name):
+            Planner(PointMass(), spread=np.ones((1, 3)), optimizers=CEM(), **{**arguments, name: value})
+    optimizers: tuple[tuple[Any, str, float], ...] = (
+        (CEM, "samples", 47),
+        (CEM, "rounds", 0),
+        (CEM, "keep", 1.0),
+        (CEM, "decay", np.inf),
+        (Gradient, "steps", 0),
+        (Gradient, "learning_rate", np.nan),
+    )
+    for optimizer, name, number in optimizers:
+        with pytest.raises(ValueError, match=name):
+            optimizer(**{name: number})
+    with pytest.raises(ValueError, match="weight"):
+        CostTerm("miss", _miss, weight=-1.0)
+    with pytest.raises(ValueError, match="width"):
+        l2(0.0)
+    with pytest.raises(ValueError, match="steps"):
+        Continued(PointMass(), PointMass(), slice(0, 1), 0)
+
+
+# Dynamics
+
+
+def test_engine_is_called_in_its_own_batches_and_loses_its_lost_rows() -> None:
+    controls = 0.25 * jax.random.normal(jax.random.key(0), (12, HORIZON, 1, 3))
+    state = jnp.broadcast_to(jnp.asarray(STATE), (12, 1, 13))
+    states = jax.jit(MujocoDynamics(Engine()).rollout)(state, controls)
+    lost = controls[:, 0, 0, 0] > 0.1
+    assert lost.any() and np.isnan(states[lost]).all()
+    np.testing.assert_allclose(states[~lost], PointMass().rollout(state, controls)[~lost], atol=1e-6)
+
+
+def test_planner_runs_on_an_engine() -> None:
+    planner = _planner(MujocoDynamics(Engine()))
+    _, info = planner.step(planner.init(jax.random.key(0)), STATE, REFERENCE, TARGET)
+    assert info.cost < 0.5 * TARGET @ TARGET and 0 < info.finite < info.candidates
+
+
+def test_continued_follows_its_links_and_freezes_the_others() -> None:
+    class Drift:
+        differentiable = False
+
+        def rollout(self, state: jax.Array, controls: jax.Array) -> jax.Array:
+            assert controls.shape == (3, 5, 0, 3)
+            return _moving(state, jnp.cumsum(jnp.ones((3, 5, 3)), axis=1))
+
+    state = jax.random.normal(jax.random.key(1), (3, 4, 13))
+    controls = jax.random.normal(jax.random.key(2), (3, HORIZON, 1, 3))
+    both = Continued(PointMass(), Drift(), slice(1, 3), 5)
+    states, head = both.rollout(state, controls), PointMass().rollout(state, controls)
+    assert states.shape == (3, HORIZON + 5, 4, 13) and not both.differentiable
+    np.testing.assert_array_equal(states[:, :HORIZON], head)
+    np.testing.assert_array_equal(states[:, -1, ::3], head[:, -1, ::3])
+    np.testing.assert_allclose(states[:, -1, 1:3, :3], head[:, -1, 1:3, :3] + 5, rtol=1e-5)
+
+
+# Splines
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=10)
+@given(seed=st.integers(0, 1000))
+def test_spline_laws(kind: Any, seed: int) -> None:
+    first, second = jax.random.normal(jax.random.key(seed), (2, KNOTS, 2, 3))
+    times = jnp.linspace(-0.1, 1.2, 29)
+    values = interpolate(first, TIMES, times, kind)
+    np.testing.assert_array_equal(interpolate(first, TIMES, TIMES, kind), first)
+    np.testing.assert_array_equal(shift(first, TIMES, 0.0, kind), first)
+    np.testing.assert_array_equal(values[times >= 0.9], jnp.broadcast_to(first[-1], (7, 2, 3)))
+    constant = jnp.broadcast_to(first[0], first.shape)
+    still = interpolate(constant, TIMES, times, kind)
+    np.testing.assert_allclose(still, jnp.broadcast_to(first[0], still.shape), rtol=1e-5)
+    both = interpolate(2 * first - second, TIMES, times, kind)
+    np.testing.assert_allclose(both, 2 * values - interpolate(second, TIMES, times, kind), atol=1e-5)
+    twice = shift(shift(first, TIMES, 0.3, kind), TIMES, 0.6, kind)
+    np.testing.assert_allclose(twice, shift(first, TIMES, 0.9, kind), atol=1e-5)
+
+
+@given(st.floats(0, 0.3), st.floats(0, 0.3))
+def test_shifts_of_a_straight_line_add_up(first: float, second: float) -> None:
+    line = TIMES[:, None] * jnp.array([1.0, -2.0])
+    twice = shift(shift(line, TIMES, first, "linear"), TIMES, second, "linear")
+    once = shift(line, TIMES, first + second, "linear")
+    np.testing.assert_allclose(twice[0], once[0], atol=1e-5)  # the later knots come to the held end
+
+
+# Costs
+
+
+@pytest.mark.parametrize("norm", [quadratic, l2(0.1), absolute(0.1)])
+def test_norms_vanish_at_zero_only_and_are_even(norm: Any) -> None:
+    residual = jax.random.normal(jax.random.key(0), (5, 3))
+    assert norm(residual).shape == (5,) and (norm(residual) > 0).all()
+    np.testing.assert_allclose(norm(residual), norm(-residual))
+    np.testing.assert_allclose(norm(jnp.zeros(3)), 0, atol=1e-7)
+    np.testing.assert_allclose(jax.grad(norm)(jnp.zeros(3)), 0)
+
+
+@given(st.floats(0, 10), st.floats(0, 10))
+def test_cost_is_linear_in_its_weights(miss: float, effort: float) -> None:
+    states = jnp.repeat(jnp.asarray(STATE)[None], HORIZON, axis=0)
+    controls = jnp.ones((HORIZON, 1, 3))
+    _, unit = evaluate(TERMS, states, controls, TARGET, {"miss": 1.0, "effort": 1.0})
+    total, shares = evaluate(TERMS, states, controls, TARGET, {"miss": miss, "effort": effort})
+    np.testing.assert_allclose(total, miss * unit["miss"] + effort * unit["effort"], rtol=1e-5)
+    np.testing.assert_allclose(shares["miss"], miss * unit["miss"], rtol=1e-5)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_costs_infinity(value: float) -> None:
+    states = jnp.zeros((HORIZON, 1, 13))
+    lost = CostTerm("lost", lambda states, controls, context: jnp.full(1, value), jnp.sum)
+    assert evaluate((lost,), states, jnp.zeros((HORIZON, 1, 3)))[0] == np.inf
+    states = states.at[3, 0, 7].set(value)
+    assert evaluate(TERMS, states, jnp.zeros((HORIZON, 1, 3)), TARGET)[0] == np.inf
+
+
+def test_residual_of_the_wrong_shape_is_named() -> None:
+    flat = CostTerm("flat", lambda states, controls, context: states.sum())
+    with pytest.raises(ValueError, match="'flat'"):
+        evaluate((flat,), jnp.zeros((HORIZON, 1, 13)), jnp.zeros((HORIZON, 1, 3)))
+
+
+# Optimisers
+
+
+def _bowl(knots: jax.Array) -> jax.Array:
+    """A bowl with ripples around 0.3; nothing below -1 is finite."""
+    cost = jnp.sum((knots - 0.3) ** 2 - 0.1 * jnp.cos(9 * knots), axis=(1, 2, 3))
+    return jnp.where((knots < -1).any(axis=(1, 2, 3)), jnp.inf, cost)
+
+
+def _search(elites: int = 6) -> Search:
+    spread = jnp.full((KNOTS, 1, 3), 0.5)
+    starts = 0.5 * jax.random.normal(jax.random.key(3), (elites, KNOTS, 1, 3))
+    return Search(jnp.zeros_like(spread), spread, starts, jnp.full(elites, jnp.inf), spread[0])
+
+
+@pytest.mark.parametrize("learning_rate", [1e-3, 0.1, 100.0])
+def test_gradient_steps_never_make_a_candidate_worse(learning_rate: float) -> None:
+    search, gradient = _search(), Gradient(steps=5, learning_rate=learning_rate, elites=4)
+    better, costs = gradient.improve(search, jax.random.key(0), _bowl)
+    assert len(costs) == 6 and all(cost.shape == (4,) for cost in costs)
+    np.testing.assert_allclose(better.costs[:4], jnp.sort(jnp.stack(costs).min(axis=0)), rtol=1e-6)
+    np.testing.assert_allclose(_bowl(better.elites[:4]), better.costs[:4], rtol=1e-6)
+    assert (better.costs[:4] <= jnp.sort(costs[0])).all()
+    np.testing.assert_array_equal(better.elites[4:], search.elites[4:])
+
+
+def test_gradient_that_is_not_finite_stops_only_its_own_candidate() -> None:
+    search, gradient = _search(2), Gradient(steps=1, elites=2)
+    slope = jnp.ones_like(search.elites).at[0, 0, 0, 0].set(jnp.nan)
+    moved, _ = gradient.update(search, search.elites, slope, gradient._optimizer.init(search.elites))
+    np.testing.assert_array_equal(moved[0], search.elites[0])
+    assert (moved[1] < search.elites[1]).all()
+
+
+def test_gradient_equals_finite_differences() -> None:
+    times = DT * jnp.arange(HORIZON)
+
+    @jax.jit
+    def cost(knots: jax.Array) -> jax.Array:
+        controls = interpolate(knots, jnp.linspace(0, times[-1], KNOTS), times)
+        states = PointMass().rollout(jnp.asarray(STATE)[None], controls[None])[0]
+        return evaluate(TERMS, states, controls, TARGET)[0]
+
+    knots, direction = 0.1 * jax.random.normal(jax.random.key(0), (2, KNOTS, 1, 3))
+    difference = (cost(knots + 0.1 * direction) - cost(knots - 0.1 * direction)) / 0.2
+    np.testing.assert_allclose(jnp.sum(jax.grad(cost)(knots) * direction), difference, rtol=1e-3)
+    np.testing.assert_allclose(jax.jvp(cost, (knots,), (direction,))[1], difference, rtol=1e-3)
+
+
+def test_cem_update_ignores_what_is_not_finite() -> None:
+    cem, search = CEM(samples=32, elites=6), _search()
+    candidates = cem.sample(search, jax.random.key(0), 32, jnp.array(True))
+    np.testing.assert_array_equal(candidates[: cem.kept], search.elites[: cem.kept])
+    np.testing.assert_array_equal(candidates[cem.kept], search.mean)
+
+    nothing = cem.update(search, candidates, jnp.full(32, jnp.inf))
+    for kept, before in zip(nothing[:3], search[:3], strict=True):
+        np.testing.assert_array_equal(kept, before)
+    single = cem.update(search, candidates, jnp.full(32, jnp.inf).at[9].set(1.0))
+    np.testing.assert_allclose(single.mean, 0.9 * candidates[9], rtol=1e-5)
+    np.testing.assert_array_equal(single.elites[0], candidates[9])
+    np.testing.assert_array_equal(single.spread, search.spread)
+    alike = cem.update(search._replace(spread=0 * search.spread), 0 * candidates, jnp.zeros(32))
+    np.testing.assert_allclose(alike.spread, cem.floor * search.scale[None].repeat(KNOTS, 0), rtol=1e-6)
+
+
+def test_cem_population_shrinks_to_twice_the_elites() -> None:
+    assert CEM(samples=256, rounds=12, elites=24).sizes == (256,) * 4 + (128,) * 3 + (64,) * 3 + (48,) * 2
+    assert CEM(samples=64, rounds=3, decay=1.0).sizes == (64,) * 3
+
+
+def test_noise_has_unit_variance_and_grows_smoother_with_its_exponent() -> None:
+    noise = {e: np.asarray(coloured_noise(jax.random.key(0), (4000, 6, 1, 3), e)) for e in (0.0, 2.0, 3.5)}
+    neighbours = [np.mean(each[:, 1:] * each[:, :-1]) for each in noise.values()]
+    np.testing.assert_allclose([each.std(axis=0) for each in noise.values()], 1, atol=0.05)
+    assert abs(neighbours[0]) < 0.02 and neighbours[0] + 0.5 < neighbours[1] < neighbours[2]

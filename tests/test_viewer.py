@@ -1,0 +1,237 @@
+"""The viewer: meshes, recordings, the page's address, the replay and the picture."""
+
+import base64
+import re
+import shutil
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from urllib.request import urlopen
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib.image import imread
+
+from larp_model.bodies import human_and_ball
+from larp_model.scene import Vector
+from larp_model.state import ORIENTATION, POSITION, VELOCITY
+from viewer import LivePage, Recording, kick_picture, nearest_approach, write_html
+from viewer.panel import Panel, within
+from viewer.scene_view import Mesh, capsule_mesh, football_meshes
+
+SCENE = human_and_ball()
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    """A rigid statue, and a ball that is struck at 0.1 s and passes 0.2 m to the left of the target."""
+    states = np.zeros((60, len(SCENE.links), 13))
+    states[..., ORIENTATION] = 1.0, 0.0, 0.0, 0.0
+    states[:, :-1, POSITION] = np.linspace((0.0, -0.3, 0.1), (0.0, 0.3, 1.7), len(SCENE.links) - 1)
+    flown = np.maximum(np.arange(60) * SCENE.dt - 0.1, 0.0)
+    states[:, -1, POSITION] = np.stack([0.5 + 8.0 * flown, 0.0 * flown, 0.11 + flown], axis=-1)
+    states[11:, -1, VELOCITY] = 8.0, 0.0, 1.0
+    predicted = states[5:40] + np.where(np.arange(13) == 1, 0.05, 0.0)
+    target = np.array([2.5, -0.2, 0.36])
+    return Recording(SCENE, states, target, predicted, 5, states, "A <kick>", {"speed": "8 m/s"})
+
+
+@pytest.fixture
+def page() -> Iterator[LivePage]:
+    with LivePage(port=0) as page:
+        yield page
+
+
+def volume(*meshes: Mesh) -> float:
+    """What closed meshes enclose together, by the divergence theorem."""
+    return sum(float(np.linalg.det(vertices[faces].astype(float)).sum()) / 6.0 for vertices, faces in meshes)
+
+
+@pytest.mark.parametrize("axis", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.6, 0.0, -0.8)])
+@pytest.mark.parametrize(("length", "radius"), [(0.4, 0.05), (0.1, 0.2), (0.0, 0.11)])
+def test_capsule_has_its_size(length: float, radius: float, axis: Vector) -> None:
+    vertices, faces = capsule_mesh(length, radius, axis)
+    exact = np.pi * radius**2 * (length + 4.0 / 3.0 * radius)
+    assert 0.97 * exact < volume((vertices, faces)) < exact
+    reach = 0.5 * length * np.abs(axis) + radius
+    np.testing.assert_array_less(np.abs(vertices).max(axis=0), reach + 1e-6)
+    assert np.ptp(vertices @ np.array(axis)) == pytest.approx(length + 2.0 * radius, rel=1e-5)
+    assert np.abs(vertices.mean(axis=0)).max() < 1e-6
+
+
+def test_capsule_is_watertight() -> None:
+    _, faces = capsule_mesh(0.3, 0.05)
+    edges = {(int(a), int(b)) for face in faces for a, b in zip(face, np.roll(face, -1), strict=True)}
+    assert len(edges) == 3 * len(faces) and all((b, a) in edges for a, b in edges)
+
+
+def test_football_is_a_sphere_of_two_colours() -> None:
+    white, dark = football_meshes(0.11)
+    for vertices, _ in (white, dark):
+        np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.11, rtol=1e-5)
+    exact = 4.0 / 3.0 * np.pi * 0.11**3
+    assert 0.98 * exact < volume(white, dark) < exact
+    assert 0.2 < volume(dark) / exact < 0.35  # the pentagons of a truncated icosahedron, seen from its centre
+
+
+@given(st.floats(-2.0, 2.0), st.floats(0.01, 2.0), st.floats(0.0, 1.0))
+def test_nearest_approach_lies_between_states(along: float, miss: float, offset: float) -> None:
+    path = np.arange(-3.0, 4.0)[:, None] * [1.0, 0.0, 0.0] + [offset, 0.0, 0.0]
+    target = np.array([along, miss, 0.0])
+    approach = nearest_approach(path, target)
+    assert approach.distance == pytest.approx(miss)
+    np.testing.assert_allclose(approach.point, [along, 0.0, 0.0], atol=1e-9)
+    assert path[approach.row, 0] <= along + 1e-9
+
+
+def test_nearest_approach_of_a_resting_ball() -> None:
+    assert nearest_approach(np.zeros((5, 3)), np.array([0.0, 3.0, 4.0])).distance == pytest.approx(5.0)
+    with pytest.raises(ValueError, match=r"path has shape \(0, 3\)"):
+        nearest_approach(np.zeros((0, 3)), np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("states", np.zeros((3, 2, 13))),
+        ("states", np.full((3, len(SCENE.links), 13), np.nan)),
+        ("predicted", np.zeros((0, len(SCENE.links), 13))),
+        ("reference", np.zeros((len(SCENE.links), 13))),
+        ("predicted_start", 60),
+        ("target", np.array([1.0, np.nan, 0.0])),
+        ("traced", 14),
+    ],
+)
+def test_recording_refuses_nonsense(recording: Recording, field: str, value: object) -> None:
+    with pytest.raises(ValueError, match=f"^{field} "):
+        replace(recording, **{field: value})  # type: ignore[arg-type]
+
+
+def test_prediction_is_aligned_with_the_truth(recording: Recording) -> None:
+    assert recording.predicted is not None and recording.predicted_path is not None
+    for row in (4, 40):
+        assert recording.predicted_at(row) is None
+    for row in (5, 39):
+        expected = recording.predicted_at(row)
+        assert expected is not None
+        np.testing.assert_allclose(expected[:, 0], recording.states[row, :, 0])
+
+
+def test_page_answers_on_this_machine_only(page: LivePage) -> None:
+    assert re.fullmatch(r"http://127\.0\.0\.1:\d+", page.address)
+    with urlopen(page.address, timeout=5) as answer:
+        assert b"<html" in answer.read().lower()
+    port = int(page.address.rpartition(":")[2])
+    with pytest.raises(OSError):  # a page on all addresses would answer on this one too
+        socket.create_connection(("127.0.0.2", port), timeout=1).close()
+
+
+def test_busy_port_is_refused(page: LivePage) -> None:
+    port = int(page.address.rpartition(":")[2])
+    with pytest.raises(ValueError, match=f"^port {port} of host '127.0.0.1' cannot be opened") as caught:
+        LivePage(port=port)
+    assert "\n" not in str(caught.value)
+
+
+def test_impossible_address_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"^port 0 of host '192\.0\.2\.1' cannot be opened"):
+        LivePage("192.0.2.1", 0)  # an address reserved for documentation: no machine has it
+    with pytest.raises(ValueError, match=r"^port is 65536"):
+        LivePage(port=65536)
+
+
+def test_page_follows_and_plays(page: LivePage, recording: Recording, capsys: pytest.CaptureFixture) -> None:
+    page.begin(recording.scene, recording.target)
+    began = time.monotonic()
+    for row, state in enumerate(recording.states):
+        page.update(state, recording.predicted if row == 4 else None, row * SCENE.dt)
+    assert time.monotonic() - began < 0.5, "update must not wait for the drawing"
+    page.finish(recording)
+    time.sleep(0.2)
+    assert page._recording is recording and page._drawn is not None
+    page.close()
+    assert not page._thread.is_alive()
+    assert capsys.readouterr().out == ""
+
+
+def test_update_needs_a_scene(page: LivePage, recording: Recording) -> None:
+    with pytest.raises(ValueError, match="before begin"):
+        page.update(recording.states[0], None, 0.0)
+
+
+def test_nobody_can_make_the_page_public(page: LivePage) -> None:
+    assert page._server.request_share_url() is None
+
+
+def test_clock_runs_over_and_survives_nonsense(page: LivePage) -> None:
+    panel = Panel(page._server.gui)
+    panel.play(1.0, 0.01)
+    assert panel.advance(0.25) == pytest.approx(0.25)
+    assert panel.advance(0.25) == pytest.approx(0.5)
+    assert panel.advance(5.0) == 1.0
+    assert panel.advance(0.0) == 0.0
+    for value in (np.nan, np.inf, -np.inf, -1.0):
+        assert within(value, 0.5, 2.0) == 0.5
+    assert within(3.0, 0.5, 2.0) == 2.0
+
+
+def test_replay_stands_alone(recording: Recording, tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "kick.html"
+    write_html(recording, path)
+    assert [file.name for file in path.parent.iterdir()] == ["kick.html"]
+    page = path.read_text(encoding="utf-8")
+    assert not re.search(r"""(src|href)\s*=\s*["']?(https?:)?//""", page)
+    assert "<title>A &lt;kick&gt;</title>" in page and "speed: 8 m/s" in page
+    assert "nearest to the target: 20.0 cm" in page
+    data = re.search(r'__VISER_EMBED_DATA__="([A-Za-z0-9+/=]+)"', page)
+    assert data is not None and len(base64.b64decode(data[1])) > 10_000
+    assert path.stat().st_size < 3_000_000
+
+
+def test_failed_replay_leaves_nothing(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr("os.replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_html(recording, tmp_path / "kick.html")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("case", ["full", "bare", "never struck", "worthless costs"])
+def test_picture_shows_something(recording: Recording, tmp_path: Path, case: str) -> None:
+    costs: dict[str, list[float]] | None = {"ball": [3.0, 1.0, 0.1], "effort": [0.0, 0.2, np.inf]}
+    if case == "bare":
+        recording, costs = (
+            replace(recording, predicted=None, predicted_start=0, reference=None, title=""),
+            None,
+        )
+    if case == "never struck":
+        recording = replace(recording, states=np.repeat(recording.states[:1], 8, axis=0))
+    if case == "worthless costs":
+        costs = {"ball": [0.0, np.inf], "effort": []}
+    kick_picture(recording, costs, tmp_path / "kick.png")
+    pixels = imread(tmp_path / "kick.png")[..., :3]
+    assert pixels.shape[:2] == (1000, 1800)
+    inked = (pixels < 0.95).any(axis=-1)
+    quarters = [half for rows in np.array_split(inked, 2) for half in np.array_split(rows, 2, axis=1)]
+    assert all(0.005 < quarter.mean() < 0.5 for quarter in quarters)
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="Chromium is not installed")
+def test_replay_runs_in_a_browser(recording: Recording, tmp_path: Path) -> None:
+    write_html(recording, tmp_path / "kick.html")
+    flags = "--headless=new --no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader"
+    command = ["chromium", *flags.split(), "--window-size=640,400", "--virtual-time-budget=1500"]
+    command += [f"--user-data-dir={tmp_path / 'profile'}", f"--screenshot={tmp_path / 'page.png'}"]
+    command += [(tmp_path / "kick.html").as_uri()]
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    pixels = imread(tmp_path / "page.png")[..., :3]
+    assert (np.ptp(pixels, axis=-1) > 0.3).mean() > 0.001, "nothing coloured is on the page"

@@ -1,0 +1,213 @@
+"""A kick in one picture: its motion in a few frames, the ball's paths from above and beside, the costs."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from itertools import cycle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Polygon
+from matplotlib.ticker import MaxNLocator
+from scipy.spatial.transform import Rotation
+
+from larp_model.scene import Scene
+from larp_model.state import ORIENTATION, POSITION, VELOCITY
+from viewer.recording import Recording, nearest_approach, write_whole
+from viewer.scene_view import PREDICTION, TARGET, TRUTH, Colour, link_colour
+
+WIDTH, HEIGHT, DOTS = 18.0, 10.0, 100  # inches, inches, dots per inch
+TILE = 2.1  # m of the strip for each frame
+# Seconds from contact to each frame but the first.
+FRAMES = {"backswing": -0.14, "contact": 0.0, "launch": 0.04, "follow-through": 0.25, "recovery": 0.7}
+STRUCK = 0.5  # m/s, speed from which the traced link counts as struck
+DECADES = 6  # how far the axis of costs reaches below the greatest
+# After Okabe and Ito, safe for all eyes.
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+QUIET = "#5b6470"
+
+
+def kick_picture(recording: Recording, costs: Mapping[str, Sequence[float]] | None, path: str | Path) -> None:
+    """Write a PNG of 1800 x 1000 pixels. costs: of each term, its share of the plan's cost at each replan."""
+    terms = {name: values for name, values in (costs or {}).items() if len(values)}
+    figure = Figure((WIDTH, HEIGHT), DOTS, facecolor="white")
+    canvas = FigureCanvasAgg(figure)
+    miss = nearest_approach(recording.path, recording.target).distance
+    facts = {"nearest to the target": f"{100.0 * miss:.1f} cm", **recording.summary}
+    figure.text(0.02, 0.955, recording.title or "Kick", fontsize=20, fontweight="bold")
+    line = "     ".join(f"{name}  {text}" for name, text in facts.items())
+    figure.text(0.02, 0.92, line, fontsize=12, color=QUIET)
+    _strip(figure.add_axes((0.02, 0.56, 0.96, 0.35)), recording)
+    width = 0.56 if terms else 0.92
+    _paths(figure.add_axes((0.05, 0.31, width, 0.2)), figure.add_axes((0.05, 0.06, width, 0.2)), recording)
+    if terms:
+        _costs(figure.add_axes((0.68, 0.06, 0.3, 0.45 - 0.025 * ((len(terms) + 1) // 2))), terms)
+    buffer = io.BytesIO()
+    canvas.print_png(buffer)
+    write_whole(path, buffer.getvalue())
+
+
+def _strip(axes: Axes, recording: Recording) -> None:
+    """The scene from its right-hand side at a few moments, the root of its first body amid each."""
+    rows = _moments(recording)
+    for tile, (row, name) in enumerate(rows.items()):
+        state = recording.states[row]
+        shift = np.array([TILE * tile - state[0, 0], 0.0])
+        expected, reference = recording.predicted_at(row), recording.reference_at(row)
+        outline = expected if recording.reference is None else reference
+        if outline is not None:
+            _outline(axes, recording.scene, outline, shift, "#8a93a0")
+        _bodies(axes, recording.scene, state, shift, tile)
+        if expected is not None:
+            centre = expected[recording.traced, POSITION][[0, 2]] + shift
+            if abs(centre[0] - TILE * tile) < 0.5 * TILE:
+                style = {"fill": False, "ec": _hex(PREDICTION), "lw": 1.5, "ls": "--", "zorder": 4}
+                _disc(axes, centre, recording.radius, **style)
+        label = f"{name}  {row * recording.scene.dt:.2f} s".strip()
+        axes.text(TILE * tile, -0.12, label, ha="center", va="top", fontsize=12)
+    axes.axhline(0.0, color=QUIET, lw=1.0, zorder=0)
+    middle = 0.5 * TILE * (len(rows) - 1)
+    across = max(6, len(rows)) * TILE
+    axes.set_xlim(middle - 0.5 * across, middle + 0.5 * across)
+    axes.set_ylim(-0.35, 2.0)
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+    shown = [name for name in ("reference", "predicted") if getattr(recording, name) is not None]
+    if shown:
+        label = f"filled: truth   outline: {shown[0]}"
+        axes.text(1.0, 1.0, label, transform=axes.transAxes, ha="right", color=QUIET)
+
+
+def _moments(recording: Recording) -> dict[int, str]:
+    """Rows worth seeing, and what they are called: around contact, or evenly spread where there is none."""
+    last = len(recording.states) - 1
+    speed = np.linalg.norm(recording.states[:, recording.traced, VELOCITY], axis=-1)
+    contact = int(np.argmax(speed > STRUCK))
+    if contact == 0:
+        return {int(row): "" for row in np.linspace(0, last, 6)}
+    rows = {contact + round(offset / recording.scene.dt): name for name, offset in FRAMES.items()}
+    return {0: "start", **{row: name for row, name in rows.items() if 0 < row <= last}}
+
+
+def _bodies(axes: Axes, scene: Scene, state: np.ndarray, shift: np.ndarray, tile: int) -> None:
+    balls = _balls(scene)
+    for row in np.argsort(-state[:, 1]):  # far links first: the eye is at y = -infinity
+        centre = state[row, 0] + shift[0]
+        if abs(centre - TILE * tile) > 0.55 * TILE:
+            continue
+        colour = (1.0, 1.0, 1.0) if row in balls else _hex(link_colour(scene.links[row]))
+        edge = "#26282e" if row in balls else "white"
+        outline = _capsule(scene, state, int(row)) + shift
+        axes.add_patch(Polygon(outline, facecolor=colour, edgecolor=edge, lw=1.0, zorder=3))
+
+
+def _outline(axes: Axes, scene: Scene, state: np.ndarray, shift: np.ndarray, colour: str) -> None:
+    """The contour of all bodies but balls: thick edges first, then white over what of them lies within."""
+    for row in set(range(len(scene.links))) - _balls(scene):
+        contour = _capsule(scene, state, row) + shift
+        axes.add_patch(Polygon(contour, facecolor="none", edgecolor=colour, lw=3.0, zorder=1))
+        axes.add_patch(Polygon(contour, facecolor="white", edgecolor="none", zorder=2))
+
+
+def _balls(scene: Scene) -> set[int]:
+    return {scene.rows(body.name).start for body in scene.bodies if body.is_ball}
+
+
+def _capsule(scene: Scene, state: np.ndarray, row: int, points: int = 24) -> np.ndarray:
+    """The contour (P, 2) [m] of a link in the x-z plane."""
+    link = scene.links[row]
+    along = Rotation.from_quat(state[row, ORIENTATION], scalar_first=True).apply(link.axis)[[0, 2]]
+    turn = np.arctan2(along[1], along[0]) + np.linspace(-0.5 * np.pi, 0.5 * np.pi, points)
+    cap = link.radius * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    reach = 0.5 * link.length * along
+    return state[row, POSITION][[0, 2]] + np.concatenate([reach + cap, -reach - cap])
+
+
+def _paths(above: Axes, beside: Axes, recording: Recording) -> None:
+    """Both paths over the distance towards the target, to one scale: sideways offset above, height below."""
+    start, target = recording.path[0], np.asarray(recording.target, float)
+    ahead = (target - start)[:2]
+    distance = float(np.linalg.norm(ahead))
+    ahead = ahead / distance if distance > 0.0 else np.array([1.0, 0.0])
+    turn = np.array([[ahead[0], ahead[1], 0.0], [-ahead[1], ahead[0], 0.0], [0.0, 0.0, 1.0]])
+
+    def view(points: np.ndarray) -> np.ndarray:
+        return (points - [start[0], start[1], 0.0]) @ turn.T
+
+    approach = nearest_approach(recording.path, target)
+    truth, nearest, goal = view(recording.path), view(approach.point), view(target)
+    seen = truth[: approach.row + 2]
+    expected = None if recording.predicted_path is None else view(recording.predicted_path)
+    low = np.min([seen.min(axis=0), goal, [0.0, -0.3, 0.0]], axis=0) - np.array([0.5, 0.1, 0.15])
+    high = np.max([seen.max(axis=0), goal, [0.0, 0.3, 0.4]], axis=0) + np.array([0.8, 0.1, 0.25])
+    width, height = above.get_position().width * WIDTH, above.get_position().height * HEIGHT
+    scale = max((high[0] - low[0]) / width, (high[1:] - low[1:]).max() / height)  # m per inch
+    for axes, row in ((above, 1), (beside, 2)):
+        planes = [0, row]
+        axes.plot(*truth[:, planes].T, color=_hex(TRUTH), lw=2.5, label="truth")
+        if expected is not None:
+            axes.plot(*expected[:, planes].T, color=_hex(PREDICTION), lw=2.0, ls="--", label="prediction")
+        _disc(axes, goal[planes], recording.radius, color=_hex(TARGET), alpha=0.5, lw=0, label="target")
+        for point in (truth[0], nearest):
+            _disc(axes, point[planes], recording.radius, fill=False, ec=_hex(TRUTH), lw=1.2)
+        axes.plot(*np.stack([nearest, goal])[:, planes].T, color="black", lw=1.2)
+        bottom = low[2] if row == 2 else 0.5 * (low[1] + high[1] - scale * height)
+        # Away from the path, and from the title above.
+        down = nearest[row] >= goal[row] or goal[row] > bottom + 0.7 * scale * height
+        axes.annotate(
+            f"misses by {100.0 * approach.distance:.1f} cm",
+            (goal[0], goal[row]),
+            xytext=(18.0, -34.0 if down else 26.0),
+            textcoords="offset points",
+            fontsize=12,
+            arrowprops={"arrowstyle": "-", "color": QUIET, "lw": 0.8},
+            bbox={"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.85},
+        )
+        axes.set_xlim(low[0], low[0] + scale * width)
+        axes.set_ylim(bottom, bottom + scale * height)
+        _plain(axes)
+    above.set_title("Ball from above", loc="left", fontsize=13)
+    above.set_ylabel("to the left [m]")
+    beside.axhline(0.0, color=QUIET, lw=1.0)
+    beside.set_title("Ball from the side", loc="left", fontsize=13)
+    beside.set_ylabel("height [m]")
+    beside.set_xlabel("from the ball's spot towards the target [m]")
+    above.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False, fontsize=11)
+
+
+def _costs(axes: Axes, terms: Mapping[str, Sequence[float]]) -> None:
+    """The terms over the replans; what is zero or infinite has no place on the logarithmic axis."""
+    greatest = 0.0
+    for (name, values), colour, marker in zip(terms.items(), cycle(PALETTE), cycle("osD^vP"), strict=False):
+        shown = np.asarray(values, float)
+        shown = np.where((shown > 0.0) & np.isfinite(shown), shown, np.nan)
+        greatest = max(greatest, float(np.nan_to_num(shown).max()))
+        axes.plot(np.arange(1, len(shown) + 1), shown, color=colour, marker=marker, ms=4, lw=1.5, label=name)
+    if greatest > 0.0:
+        axes.set_yscale("log")
+        axes.set_ylim(max(axes.get_ylim()[0], greatest * 10.0**-DECADES), None)
+    axes.set_xlim(0.5, max(map(len, terms.values())) + 0.5)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+    axes.set_xlabel("replan")
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False, fontsize=11)
+    axes.figure.text(0.68, 0.525, "Cost of the plan, by term", fontsize=13)
+    _plain(axes)
+
+
+def _disc(axes: Axes, centre: np.ndarray, radius: float, **style: Any) -> None:
+    axes.add_patch(Circle((float(centre[0]), float(centre[1])), radius, **style))
+
+
+def _plain(axes: Axes) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(True, color="#e3e6ea", lw=0.8)
+    axes.set_axisbelow(True)
+
+
+def _hex(colour: Colour) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*colour)

@@ -1,0 +1,130 @@
+"""What a kick left behind, for whoever draws it; and files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from larp_model.scene import Scene
+from larp_model.state import POSITION, SIZE
+
+
+class Approach(NamedTuple):
+    """Where a path comes nearest to a target."""
+
+    distance: float  # m
+    point: np.ndarray  # (3,) m, on the path
+    row: int  # of the path, at or before the point
+
+
+def nearest_approach(path: np.ndarray, target: np.ndarray) -> Approach:
+    """Where the straight lines between the points (T, 3) [m] of a path pass nearest to `target` (3,) [m].
+
+    A ball flies some 10 cm between two states, so that the distance at the states alone overstates the miss.
+    """
+    path, target = np.asarray(path, float), np.asarray(target, float)
+    if path.ndim != 2 or path.shape[1] != 3 or not len(path):
+        raise ValueError(f"path has shape {path.shape}, but needs (T, 3) with at least one point")
+    start, step = path, np.diff(path, axis=0, append=path[-1:])
+    squared = np.sum(step**2, axis=1)
+    fraction = np.sum((target - start) * step, axis=1) / np.where(squared > 0.0, squared, 1.0)
+    points = start + np.clip(fraction, 0.0, 1.0)[:, None] * step
+    distance = np.linalg.norm(points - target, axis=1)
+    row = int(np.argmin(distance))
+    return Approach(float(distance[row]), points[row], row)
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A motion in the truth, and what was expected of it.
+
+    states: (T, L, 13) of the truth, row k at the time k `scene.dt`.
+    target: (3,) [m], where the traced link should pass.
+    predicted: (T', L, 13) of the model, its row 0 at the truth's row `predicted_start`.
+    reference: (T'', L, 13), from the truth's row 0 on.
+    summary: what to print beside the motion, with units, e.g. {"ball speed": "11.2 m/s"}.
+    traced: row in the state of the link whose path is drawn; by default the last, the ball.
+    """
+
+    scene: Scene
+    states: np.ndarray
+    target: np.ndarray
+    predicted: np.ndarray | None = None
+    predicted_start: int = 0
+    reference: np.ndarray | None = None
+    title: str = ""
+    summary: Mapping[str, str] = field(default_factory=dict)
+    traced: int = -1
+
+    def __post_init__(self) -> None:
+        links = len(self.scene.links)
+        for name in ("states", "predicted", "reference"):
+            value = getattr(self, name)
+            if value is None and name != "states":
+                continue
+            if np.ndim(value) != 3 or np.shape(value)[1:] != (links, SIZE) or not len(value):
+                raise ValueError(f"{name} has shape {np.shape(value)}, but needs (T > 0, {links}, {SIZE})")
+            if not np.all(np.isfinite(value)):
+                raise ValueError(f"{name} holds values that are not finite, but all must be")
+        if np.shape(self.target) != (3,) or not np.all(np.isfinite(self.target)):
+            raise ValueError(f"target is {self.target!r}, but must be three finite numbers")
+        if not 0 <= self.predicted_start < len(self.states):
+            raise ValueError(
+                f"predicted_start is {self.predicted_start!r}, but must be a row in [0, {len(self.states)})"
+            )
+        if not -links <= self.traced < links:
+            raise ValueError(f"traced is {self.traced!r}, but must be a row in [{-links}, {links})")
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last state [s]."""
+        return (len(self.states) - 1) * self.scene.dt
+
+    @property
+    def path(self) -> np.ndarray:
+        """(T, 3) [m], where the traced link went in the truth."""
+        return np.asarray(self.states)[:, self.traced, POSITION]
+
+    @property
+    def predicted_path(self) -> np.ndarray | None:
+        """(T', 3) [m], where the model expected it to go."""
+        return None if self.predicted is None else np.asarray(self.predicted)[:, self.traced, POSITION]
+
+    @property
+    def radius(self) -> float:
+        """Radius of the traced link [m]."""
+        return self.scene.links[self.traced].radius
+
+    def predicted_at(self, row: int) -> np.ndarray | None:
+        """The state (L, 13) that the model expected at a row of the truth; None where it expected nothing."""
+        index = row - self.predicted_start
+        if self.predicted is None or not 0 <= index < len(self.predicted):
+            return None
+        return np.asarray(self.predicted[index])
+
+    def reference_at(self, row: int) -> np.ndarray | None:
+        """The reference's state (L, 13) at a row of the truth; None beyond its end."""
+        if self.reference is None or row >= len(self.reference):
+            return None
+        return np.asarray(self.reference[row])
+
+
+def write_whole(path: str | Path, data: bytes) -> None:
+    """Write a file, making its folder, so that nobody ever sees half of it."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
+        try:
+            os.chmod(file.name, 0o644)  # temporary files are born private
+            file.write(data)
+            file.close()
+            os.replace(file.name, path)
+        except BaseException:
+            os.unlink(file.name)
+            raise

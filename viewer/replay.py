@@ -1,0 +1,39 @@
+"""A recording as one HTML file that plays by itself, without a server and without the network."""
+
+from __future__ import annotations
+
+from html import escape
+from pathlib import Path
+
+from viewer.app import close_server, open_server
+from viewer.recording import Recording, write_whole
+from viewer.stage import LEGEND, Stage
+
+FRAME = 0.02  # s of recorded time between two pictures
+
+_CAPTION = """<div style="position:fixed;z-index:1;right:1em;top:1em;max-width:28em;padding:.6em .9em;
+font:14px/1.5 system-ui,sans-serif;color:#222;background:#fffc;pointer-events:none">{}</div>"""
+
+
+def write_html(recording: Recording, path: str | Path) -> None:
+    """Write the page: truth, prediction as a ghost, both paths, target, and the summary in a corner."""
+    server = open_server(port=0)
+    try:
+        stage = Stage(server, recording.scene, recording.target, recording.traced)
+        miss = stage.trace(recording.path, recording.predicted_path)
+        film = server.get_scene_serializer()
+        stride = max(1, round(FRAME / recording.scene.dt))
+        for row in range(0, len(recording.states), stride):
+            stage.show(recording.states[row], recording.predicted_at(row))
+            film.insert_sleep(stride * recording.scene.dt)
+        page = film.as_html()
+    finally:
+        close_server(server)
+    facts = {"nearest to the target": f"{100.0 * miss:.1f} cm", **recording.summary}
+    title = escape(recording.title or "Replay")
+    lines = [*(f"{name}: {text}" for name, text in facts.items()), LEGEND]
+    caption = "<br>".join([f"<b>{title}</b>", *map(escape, lines)])
+    head, _, rest = page.partition("<title>")
+    page = f"{head}<title>{title}{rest[rest.index('</title>') :]}"
+    body = page.rindex("</body>")
+    write_whole(path, (page[:body] + _CAPTION.format(caption) + page[body:]).encode())
