@@ -79,8 +79,7 @@ def closest(first: Segment, second: Segment) -> Closest:
     between = first.centre - second.centre
     aa, bb = _dot(first.half, first.half), _dot(second.half, second.half)
     ab, ac, bc = _dot(first.half, second.half), _dot(first.half, between), _dot(second.half, between)
-    tiny = 1e-12
-    aa, bb = aa + tiny, bb + tiny
+    aa, bb = jnp.where(aa < 1e-12, 1.0, aa), jnp.where(bb < 1e-12, 1.0, bb)  # every place on a ball's axis is one
     determinant = aa * bb - ab * ab
     parallel = determinant < 1e-6 * aa * bb
     # On parallel axes every place of the overlap is closest: take its middle, projected on the first axis.

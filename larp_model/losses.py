@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -11,14 +13,30 @@ from larp_model import features
 from larp_model import state as packed
 from larp_model.scene import Scene
 
+# Where a predicted link is further than this from the truth, the sequence has gone another way [m].
+LOST = 1.0
+
 
 class LossWeights(NamedTuple):
-    """Weights of the terms. velocity [s^2] is not in the paper, which rightly finds that it cannot replace position."""
+    """Weights of the terms, and how far their errors count as squares.
+
+    velocity [s^2] is not in the paper, which rightly finds that it cannot replace position. Errors beyond `far` [m] and
+    `fast` [m/s] count linearly: impacts that nothing can predict would otherwise drown those that can be learned.
+    """
 
     position: float = 1.0
     rotation: float = 1.0
     displacement: float = 0.1
     velocity: float = 0.0
+    far: float = math.inf
+    fast: float = 1.0
+
+
+def pseudo_huber(squared: Array, limit: float) -> Array:
+    """A squared error that becomes linear beyond `limit`."""
+    if math.isinf(limit):
+        return squared
+    return 2.0 * limit**2 * (jnp.sqrt(1.0 + squared / limit**2) - 1.0)
 
 
 def position(predicted: Array, true: Array) -> Array:
@@ -32,12 +50,8 @@ def rotation(predicted: Array, true: Array) -> Array:
 
 
 def velocity(predicted: Array, true: Array) -> Array:
-    """Difference (*, L) of the links' velocities, squared [m^2/s^2] below 1 m/s and linear above.
-
-    So an impact that is missed by a step does not drown everything else.
-    """
-    squared = jnp.sum((packed.velocity(predicted) - packed.velocity(true)) ** 2, axis=-1)
-    return 2.0 * (jnp.sqrt(1.0 + squared) - 1.0)
+    """Squared difference (*, L) [m^2/s^2] of the links' velocities."""
+    return jnp.sum((packed.velocity(predicted) - packed.velocity(true)) ** 2, axis=-1)
 
 
 def displacement(scene: Scene, predicted: Array, shape: Array) -> Array:
@@ -48,13 +62,22 @@ def displacement(scene: Scene, predicted: Array, shape: Array) -> Array:
 def total(
     scene: Scene, weights: LossWeights, emphasis: Array, predicted: Array, true: Array
 ) -> tuple[Array, dict[str, Array]]:
-    """The weighted sum and its terms, averaged over states (B, H, L, 13); `emphasis` (L,) weighs the links."""
+    """The weighted sum and its terms, averaged over states (B, H, L, 13); `emphasis` (L,) weighs the links.
+
+    Sequences that stray further than `LOST` teach nothing: they are left out, and "lost" is their share.
+    """
     shape = features.morphology(scene)
-    fast = velocity(predicted, true)
+    places = position(predicted, true)
+    kept = jax.lax.stop_gradient(jnp.max(places, axis=(1, 2)) < LOST**2).astype(places.dtype)
+
+    def mean(values: Array) -> Array:
+        return jnp.sum(kept * jnp.sum(values, axis=(1, 2))) / (jnp.maximum(jnp.sum(kept), 1.0) * places[0].size)
+
     terms = {
-        "position": jnp.mean(emphasis * position(predicted, true)),
-        "rotation": jnp.mean(rotation(predicted, true)),
-        "displacement": jnp.sum(displacement(scene, predicted, shape)) / fast.size,
-        "velocity": jnp.mean(emphasis * fast),
+        "position": mean(emphasis * pseudo_huber(places, weights.far)),
+        "rotation": mean(rotation(predicted, true)),
+        "displacement": mean(displacement(scene, predicted, shape)),
+        "velocity": mean(emphasis * pseudo_huber(velocity(predicted, true), weights.fast)),
     }
-    return sum(getattr(weights, name) * value for name, value in terms.items()), terms  # type: ignore[return-value]
+    loss = jnp.sum(jnp.stack([getattr(weights, name) * value for name, value in terms.items()]))
+    return loss, terms | {"lost": 1.0 - jnp.mean(kept)}

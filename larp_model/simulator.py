@@ -22,8 +22,13 @@ from larp_model.scene import Body, Pair, Scene
 
 # Solid spheres: moment of inertia / (mass x radius^2).
 SPHERE = 0.4
-CONTACT_COEFFICIENTS = 6
-BALL_COEFFICIENTS = 8
+# Bounds of what the networks may add, so that no state, however odd, is thrown out of the world.
+# Contact: share of the free impact, normal speed [m/s], slide, binormal, upward speed [m/s], lag [ms].
+CONTACT_BOUNDS = (1.0, 3.0, 1.0, 1.0, 3.0, 5.0)
+# Ball on the ground: share of the free bounce, speed [m/s], stick, drag, grip, roll, twist, lag [ms].
+BALL_BOUNDS = (1.0, 1.0, 0.5, 0.5, 0.5, 0.5, 0.5, 3.0)
+# Articulated bodies: changes, in their standard deviations.
+CHANGE_BOUND = 20.0
 
 
 class Weights(NamedTuple):
@@ -56,7 +61,7 @@ def by_scalars(config: Config, body: Body) -> bool:
 def dynamics_network(config: Config, body: Body) -> Perceptron:
     """f_d for a body's kind."""
     if by_scalars(config, body):
-        return Perceptron(config.ball_layers, config.ball_width, BALL_COEFFICIENTS, config.skip)
+        return Perceptron(config.ball_layers, config.ball_width, len(BALL_BOUNDS), config.skip)
     outputs = len(body.links) * (6 if config.predict == "velocity" else 12)
     layers, width = (config.ball_layers, config.ball_width) if body.is_ball else (config.layers, config.width)
     return Perceptron(layers, width, outputs, config.skip)
@@ -71,8 +76,14 @@ def evaluate(network: Perceptron, weights: Weights, name: str, inputs: Array) ->
 
 def contact_network(config: Config) -> Perceptron:
     """f_c."""
-    outputs = CONTACT_COEFFICIENTS if config.contact == "impulse" else 6
+    outputs = len(CONTACT_BOUNDS) if config.contact == "impulse" else 6
     return Perceptron(config.contact_layers, config.contact_width, outputs, config.skip)
+
+
+def bounded(outputs: Array, bounds: tuple[float, ...] | float) -> Array:
+    """Outputs (*, O) within +-bounds, smoothly, and unchanged near zero."""
+    limit = jnp.asarray(bounds, outputs.dtype)
+    return limit * jnp.tanh(outputs / limit)
 
 
 class Pooled(NamedTuple):
@@ -98,7 +109,7 @@ def contacts(scene: Scene, config: Config, weights: Weights, state: Array, contr
                 feature += jnp.einsum("bpf,pl->blf", network(seen), rows)
             continue
         touch = features.contact_inputs(scene, pair, state, control, shape)
-        outputs = network(touch.inputs) * touch.near[..., None]
+        outputs = bounded(network(touch.inputs), CONTACT_BOUNDS) * touch.near[..., None]
         impulse, lag = contact_impulse(touch, outputs)
         on_first = jnp.concatenate([-impulse, jnp.cross(touch.first_arm, -impulse)], axis=-1)
         on_second = jnp.concatenate([impulse, jnp.cross(touch.second_arm, impulse)], axis=-1)
@@ -114,7 +125,7 @@ def contact_impulse(touch: features.Touch, outputs: Array) -> tuple[Array, Array
     Along the normal: the free impact's, which the network scales and adds to; across it: along the slide, the binormal
     and, for the ground's reaction, up.
     """
-    scale, add, along, across, up, late = jnp.split(outputs, CONTACT_COEFFICIENTS, axis=-1)
+    scale, add, along, across, up, late = jnp.split(outputs, len(CONTACT_BOUNDS), axis=-1)
     change = touch.impact.change[..., None]
     normal = change * (1.0 + scale) + add
     vertical = jnp.array([0.0, 0.0, 1.0], outputs.dtype)
@@ -172,7 +183,7 @@ def body_step(
     turn = frame(config, state)
     inputs = features.body_inputs(body, turn, state, control, torque, apart, pooled, shape)
     outputs = evaluate(dynamics_network(config, body), weights, name, inputs)
-    outputs = weights.outputs[name].restore(outputs).reshape(state.shape[0], -1, 3)
+    outputs = weights.outputs[name].restore(bounded(outputs, CHANGE_BOUND)).reshape(state.shape[0], -1, 3)
     change = rotation.about_z(outputs, turn[:, None]).reshape(state.shape[0], -1, links, 3)
     return integrate(config, state, change, scene.dt)
 
@@ -235,8 +246,8 @@ def ball_step(
     radius, mass = shape[:, 1:2], shape[:, 2:3]
     ground = features.ball_inputs(body, ball, impulse, shape, scene.gravity, dt)
     outputs = evaluate(dynamics_network(config, body), weights, name, ground.inputs)
-    outputs = outputs * ground.near[:, None]
-    scale, add, stick, drag, grip, roll, twist, late = jnp.split(outputs, BALL_COEFFICIENTS, axis=-1)
+    outputs = bounded(outputs, BALL_BOUNDS) * ground.near[:, None]
+    scale, add, stick, drag, grip, roll, twist, late = jnp.split(outputs, len(BALL_BOUNDS), axis=-1)
     up = jnp.array([0.0, 0.0, 1.0], state.dtype)
     velocity, spin = packed.velocity(ball), packed.angular_velocity(ball)
     along = velocity * (1.0 - up)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -40,19 +41,21 @@ class Recipe:
     """How to train.
 
     curriculum: (unroll in steps, share of the updates) in order. learning_rate falls to `final` of itself by a cosine.
-    clip: largest gradient norm. drop: norm beyond which a batch is dropped. contact_share: windows that start within
-    `before_contact` steps before the first contact. emphasis: weight of each body's links in the loss.
+    clip: largest gradient norm. drop: norm beyond which a batch is dropped. contact_share: windows that start from
+    `before_contact` steps before to `after_contact` steps after the first contact. emphasis: weight of each body's
+    links in the loss.
     """
 
     updates: int = 20000
     batch: int = 256
-    curriculum: tuple[tuple[int, float], ...] = ((4, 0.15), (8, 0.2), (20, 0.65))
+    curriculum: tuple[tuple[int, float], ...] = ((2, 0.1), (4, 0.1), (8, 0.15), (14, 0.15), (20, 0.5))
     learning_rate: float = 1e-3
     final: float = 0.01
     clip: float = 0.3
     drop: float = 30.0
     contact_share: float = 0.7
     before_contact: int = 10
+    after_contact: int = 0
     emphasis: tuple[tuple[str, float], ...] = (("ball", 3.0),)
     loss: LossWeights = field(default_factory=LossWeights)
     stop_gradient: bool = True
@@ -105,7 +108,7 @@ class Windows:
             if last < 0:
                 raise ValueError(f"episodes have {source.controls.shape[1]} steps, but the unroll needs {steps}")
             start = random.integers(last + 1, size=count)
-            back = random.integers(self.recipe.before_contact + 1, size=near)
+            back = random.integers(-self.recipe.after_contact, self.recipe.before_contact + 1, size=near)
             start[:near] = np.clip(contacts[chosen[:near]] - back, 0, last)
             columns = start[:, None] + np.arange(steps + 1)
             rows = chosen[:, None]
@@ -175,7 +178,9 @@ def train(
     weights = statistics_of(scene, config, windows, random) if start is None else start
     transform = optimiser(recipe)
     progressed = Progressed(weights.networks, transform.init(weights.networks), 0)
-    manager = ocp.CheckpointManager(folder.absolute(), options=ocp.CheckpointManagerOptions(max_to_keep=1, create=True))
+    manager = ocp.CheckpointManager(
+        (folder / "checkpoints").absolute(), options=ocp.CheckpointManagerOptions(max_to_keep=1, create=True)
+    )
     if manager.latest_step() is not None:
         restored = manager.restore(manager.latest_step(), args=ocp.args.StandardRestore((progressed, weights[1:])))
         progressed, statistics = Progressed(*restored[0]), restored[1]
@@ -233,11 +238,13 @@ def train(
                 now = time.perf_counter()
                 mean = {name: float(np.nanmean([row[name] for row in recent])) for name in values}
                 rate = (index + 1 - first) * recipe.batch / (now - begin)
-                log["history"].append({"update": index + 1, **mean, "sequences_per_second": rate})
+                log["history"].append(
+                    {"update": index + 1, "unroll": recipe.unroll(index), **mean, "sequences_per_second": rate}
+                )
                 note = f"loss {mean['loss']:.3g} position {mean['position'] ** 0.5:.4f} m {rate:.0f} sequences/s"
                 bar.update(task, completed=index + 1, note=note)
-                if quiet is None:
-                    print(index + 1, recipe.unroll(index), log["history"][-1], flush=True)
+                with (folder / "history.jsonl").open("a") as file:
+                    file.write(json.dumps(log["history"][-1]) + "\n")
                 recent = []
                 if now - saved > 60 or index + 1 == recipe.updates:
                     content = (Progressed(networks, state, index + 1), weights[1:])

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+from larp_model import features
 from larp_model import state as packed
 from larp_model.scene import Scene
 from larp_model.truth.episodes import Episodes, record
@@ -88,9 +90,19 @@ def random_starts(
     flying = kind > 0.85
     ball[flying, 2] += random.uniform(0.0, 1.0, count)[flying]
     ball[rolling, 10:13] = 8.0 * random.standard_normal((count, 3))[rolling]
+    ball[:, 2] = np.maximum(ball[:, 2], radius)
     states[:, -1] = ball
-    states[:, -1, 2] = np.maximum(states[:, -1, 2], radius)
+    # A ball inside a leg is no initial state: it waits out of reach instead.
+    states[overlaps(scene, states), -1, :3] = (3.0, 0.0, radius)
     return _turn(states, random.uniform(-np.pi, np.pi, count)), begin
+
+
+def overlaps(scene: Scene, states: np.ndarray) -> np.ndarray:
+    """(N,) which of the states (N, L, 13) have a link inside another that it can touch."""
+    shape = features.morphology(scene)[None]
+    idle = jnp.zeros((len(states), len(scene.motors), 3))
+    gaps = [features.contact_inputs(scene, pair, jnp.asarray(states), idle, shape).gap for pair in scene.pairs]
+    return np.asarray(jnp.concatenate(gaps, axis=1).min(axis=1) < 0.0)
 
 
 def _turn(states: np.ndarray, angle: np.ndarray) -> np.ndarray:

@@ -65,21 +65,22 @@ class Preset:
     every: int
 
 
+# One population size throughout, because every size is compiled apart.
 PRESETS = {
     "fast": Preset(
-        (CEM(samples=96, rounds=5, elites=16),),
-        (CEM(samples=64, rounds=1, elites=16),),
+        (CEM(samples=128, rounds=4, elites=16, decay=1.0),),
+        (CEM(samples=64, rounds=1, elites=16, decay=1.0),),
         every=5,
     ),
     "balanced": Preset(
-        (CEM(samples=256, rounds=8, elites=24), Gradient(steps=8, elites=16)),
-        (CEM(samples=128, rounds=2, elites=24), Gradient(steps=2, elites=8)),
+        (CEM(samples=256, rounds=10, elites=24, decay=1.0),),
+        (CEM(samples=128, rounds=3, elites=24, decay=1.0),),
         every=4,
     ),
     "accurate": Preset(
-        (CEM(samples=512, rounds=12, elites=32), Gradient(steps=16, elites=32)),
-        (CEM(samples=256, rounds=3, elites=32), Gradient(steps=4, elites=16)),
-        every=3,
+        (CEM(samples=512, rounds=12, elites=32, decay=1.0), Gradient(steps=16, elites=32)),
+        (CEM(samples=256, rounds=4, elites=32, decay=1.0),),
+        every=2,
     ),
 }
 
@@ -394,10 +395,10 @@ def main(
         page.wait()
 
 
-def run(task: Callable[..., None]) -> None:
+def run(task: Callable[..., None], arguments: list[str] | None = None) -> None:
     """A task's command line: wrong values end it with one line and exit code 2."""
     try:
-        tyro.cli(task)
+        tyro.cli(task, args=arguments)
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
+from larp_model.bodies import standing_height
 from larp_model.scene import Body, Scene
-from larp_model.truth.mujoco import Truth
+from larp_model.truth.mujoco import Truth, finite
+from tasks import bvh
 from tasks.key_poses import KEY_POSES, KEY_TIMES, START
+from tasks.tracking import Tracker
+
+# Steps around the strike in which a captured kick may meet its ball.
+MEETING = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,3 +99,109 @@ def embedded(scene: Scene, steps: int = 300) -> Reference:
     if not moving.any():
         raise ValueError("scene: its human misses the ball in the embedded reference kick")
     return Reference(states, controls, int(moving.argmax()) - 1)
+
+
+def captured(path: str | Path, scene: Scene, seconds_before: float = 0.6, seconds_after: float = 1.0) -> Reference:
+    """A captured kick (BVH), performed in the truth by the human of `scene`, who follows the clip around its strike.
+
+    It is turned so that the ball leaves along x, and mirrored if its kicking foot is the left. The ball waits where
+    the foot, as performed, would strike it hardest. ValueError where the file is not understood or no ball is hit.
+    """
+    for name, value in (("seconds_before", seconds_before), ("seconds_after", seconds_after)):
+        if not 0.2 <= value <= 10.0:
+            raise ValueError(f"{name} is {value!r}, but must be from 0.2 to 10 s")
+    motion = bvh.load(path)
+    if (fastest := bvh.toe_speed(motion).max()) < bvh.SLOWEST_KICK:
+        raise ValueError(f"{path} is no kick: its toes reach {fastest:.1f} m/s, but need {bvh.SLOWEST_KICK:g} m/s")
+    if bvh.kicking_side(motion) == "Left":
+        motion = bvh.mirrored(motion)
+    frame = bvh.strike(motion)
+    clip = motion.cut(frame - round(seconds_before * motion.rate), frame + round(seconds_after * motion.rate))
+    wanted, controls = _wanted(scene, clip)
+    expected, last = round(bvh.strike(clip) / clip.rate / scene.dt), len(controls) - 1
+    tracker = Tracker(scene, wanted, _importance(scene, len(wanted), expected), controls)
+    before, targets = tracker.follow(wanted[0], 0, min(expected + MEETING, last))
+    spot, touch = _spot(scene, before, expected)
+    before[:, -1, packed.POSITION] = spot
+    after, onwards = tracker.follow(before[touch], touch, last)
+    states = np.concatenate([before[:touch], after])
+    if not finite(states[None])[0]:
+        raise ValueError(f"{path}: the truth diverges when the human performs this kick")
+    moving = np.linalg.norm(states[:, -1, packed.VELOCITY], axis=-1) > 0.5
+    if not moving.any():
+        raise ValueError(f"{path}: the human misses the ball when it performs this kick")
+    strike = int(moving.argmax()) - 1
+    return Reference(_launched_along_x(states, strike), np.concatenate([targets[:touch], onwards]), strike)
+
+
+def _launched_along_x(states: np.ndarray, strike: int) -> np.ndarray:
+    """The states (T, L, 13), turned about z so that the ball leaves along x."""
+    x, y, _ = states[min(strike + MEETING, len(states) - 1), -1, packed.VELOCITY]
+    turn = Rotation.from_rotvec((0.0, 0.0, -np.arctan2(y, x)))
+    turned = states.copy()
+    for columns in (packed.POSITION, packed.VELOCITY, packed.ANGULAR_VELOCITY):
+        turned[..., columns] = turn.apply(states[..., columns].reshape(-1, 3)).reshape(*states.shape[:2], 3)
+    orientation = turn * Rotation.from_quat(states[..., packed.ORIENTATION].reshape(-1, 4), scalar_first=True)
+    turned[..., packed.ORIENTATION] = orientation.as_quat(scalar_first=True).reshape(*states.shape[:2], 4)
+    return turned
+
+
+def _wanted(scene: Scene, clip: bvh.Motion) -> tuple[np.ndarray, np.ndarray]:
+    """The clip as states (T, L, 13) and joint targets (T, J, 3) [rad] of the human, its ball out of the way.
+
+    The targets are ahead of the joint angles by what the servos lag behind: damping / stiffness.
+    """
+    human, ball = scene.bodies[0], scene.bodies[-1]
+    orientations, poses = bvh.retarget(clip, human, scene.dt)
+    root = Rotation.from_quat(orientations, scalar_first=True)
+    states = np.stack([standing_on_ground(scene, pose, pelvis) for pose, pelvis in zip(poses, root, strict=True)])
+    rows = scene.rows(human.name)
+    size = standing_height(human) / clip.hip_height
+    way = size * (clip.path("Hips") - clip.path("Hips")[0])
+    times = np.arange(len(way)) / clip.rate
+    for axis in (0, 1):
+        states[:, rows, axis] += np.interp(np.arange(len(poses)) * scene.dt, times, way[:, axis])[:, None]
+    states[:, rows, packed.VELOCITY] = np.gradient(states[:, rows, packed.POSITION], scene.dt, axis=0)
+    for row in range(rows.start, rows.stop):
+        turned = Rotation.from_quat(states[:, row, packed.ORIENTATION], scalar_first=True)
+        states[:-1, row, packed.ANGULAR_VELOCITY] = (turned[1:] * turned[:-1].inv()).as_rotvec() / scene.dt
+    states[:, -1, packed.POSITION] = (-50.0, 0.0, ball.links[0].radius)
+    lag = np.array([motor.damping / motor.stiffness for motor in scene.motors])[:, None]
+    return states, poses + lag * np.gradient(poses, scene.dt, axis=0)
+
+
+def _importance(scene: Scene, steps: int, strike: int) -> np.ndarray:
+    """How much it matters where each link is (T, L): pelvis and feet more, the kicking foot near the strike most."""
+    human = scene.bodies[0]
+    pelvis, left, right = (scene.index(human.name, link) for link in ("pelvis", "left_foot", "right_foot"))
+    weights = np.zeros((steps, len(scene.links)))
+    weights[:, scene.rows(human.name)] = 1.0
+    weights[:, [pelvis, left, right]] = 5.0
+    weights[max(strike - MEETING, 0) : strike + MEETING, right] = 100.0
+    return weights
+
+
+def _spot(scene: Scene, states: np.ndarray, strike: int) -> tuple[np.ndarray, int]:
+    """Where a ball (3,) [m] just touches the right foot, ahead of its middle, and in which step near the strike."""
+    human, radius = scene.bodies[0], scene.bodies[-1].links[0].radius
+    foot = human.links[human.link("right_foot")]
+    path = states[:, scene.index(human.name, "right_foot")]
+    height = path[:, 2] - radius
+    speed = np.linalg.norm(path[:, packed.VELOCITY][:, :2], axis=-1)
+    reach = radius + foot.radius
+    # The foot pushes along the line of centres, which its height tilts out of the horizontal.
+    push = speed * np.sqrt(np.maximum(1.0 - (height / reach) ** 2, 0.0))
+    push[abs(np.arange(len(path)) - strike) > MEETING] = 0.0
+    touch = int(push.argmax())
+    if not push[touch] > 0.0:
+        raise ValueError(f"path: its kick passes {height[strike]:.2f} m above the centre of a ball, and finds none")
+
+    forwards = np.array([*path[touch, packed.VELOCITY][:2], 0.0]) / speed[touch]
+    turn = Rotation.from_quat(path[touch, packed.ORIENTATION], scalar_first=True)
+    along = np.linspace(-0.5, 0.5, 21)[:, None] * foot.length * turn.apply(foot.axis)
+    # Points of the foot's axis, from the ball's centre below them; moved ahead, it is out of reach of all of them.
+    apart = along + np.array([0.0, 0.0, height[touch]])
+    ahead = apart @ forwards
+    aside = np.sum(apart**2, axis=-1) - ahead**2
+    distance = np.max(ahead + np.sqrt(np.maximum(reach**2 - aside, 0.0)), where=aside < reach**2, initial=0.0)
+    return np.array([*(path[touch, :2] + distance * forwards[:2]), radius]), touch

@@ -11,8 +11,10 @@ import json
 import os
 import platform
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -21,6 +23,7 @@ from rich.console import Console
 from larp_model import evaluation, networks, training
 from larp_model import weights as stored
 from larp_model.losses import LossWeights
+from larp_model.scene import Scene
 from larp_model.simulator import Simulator, Weights
 from larp_model.truth import episodes as truth_episodes
 from larp_model.truth.episodes import Episodes
@@ -29,6 +32,30 @@ from tasks.data import WINDOWS, random_episodes, random_task
 from tasks.kick import WEIGHTS, Kick, dynamics_of, planners_of, prepare, remember_compilations, run
 
 EVALUATION_SEED = 1
+LOSS = LossWeights(velocity=3e-3, far=0.05, fast=0.5)
+
+
+class Stage(NamedTuple):
+    """A part of the training: what it is called, whether it adds the planner's candidates first, and how it trains."""
+
+    name: str
+    planned: bool
+    recipe: training.Recipe
+
+
+# Single steps around contacts teach the impact at a twentieth of a rollout's price; rollouts then teach to stay true.
+STAGES = (
+    Stage(
+        "steps",
+        False,
+        training.Recipe(6000, 512, ((1, 1.0),), learning_rate=1e-3, before_contact=2, after_contact=3, loss=LOSS),
+    ),
+    Stage(
+        "rollouts", False, training.Recipe(3600, 256, ((4, 0.15), (8, 0.25), (20, 0.6)), learning_rate=5e-4, loss=LOSS)
+    ),
+    Stage("planned1", True, training.Recipe(1500, 256, ((20, 1.0),), learning_rate=2e-4, loss=LOSS)),
+    Stage("planned2", True, training.Recipe(1500, 256, ((20, 1.0),), learning_rate=2e-4, loss=LOSS)),
+)
 
 
 def planned_episodes(kick: Kick, weights: Path, tasks: int, elites: int, seed: int) -> tuple[Episodes, int]:
@@ -52,22 +79,22 @@ def planned_episodes(kick: Kick, weights: Path, tasks: int, elites: int, seed: i
     return truth_episodes.record(Truth(kick.scene, 128), np.stack(states), np.stack(controls))
 
 
-def stage(path: Path, kick: Kick, make: Any, console: Console) -> Episodes:
+def stored_episodes(path: Path, scene: Scene, make: Callable[[], tuple[Episodes, int]], console: Console) -> Episodes:
     """The episodes of a file, made and stored first where it is not there."""
     if not path.exists():
         begin = time.perf_counter()
         episodes, dropped = make()
-        truth_episodes.save(path, kick.scene, episodes)
+        truth_episodes.save(path, scene, episodes)
         console.print(f"{path.name}: {len(episodes)} episodes, {dropped} diverged, {time.perf_counter() - begin:.0f} s")
-    return truth_episodes.load(path, kick.scene)
+    return truth_episodes.load(path, scene)
 
 
 def main(
     folder: Path = Path("runs/train"),
     out: Path = Path("runs/train/weights"),
-    episodes: int = 12000,
-    updates: tuple[int, ...] = (9000, 5000, 5000),
+    episodes: int = 10000,
     tasks: int = 40,
+    effort: float = 1.0,
     seed: int = 100,
 ) -> None:
     """Train the kick's learned simulator.
@@ -76,55 +103,48 @@ def main(
         folder: where the run keeps its stages and checkpoints.
         out: where the weights and their manifest go.
         episodes: random truth episodes around the reference.
-        updates: of the first training and of each round after the planner's candidates were added.
-        tasks: kicks planned for the candidates of each round.
+        tasks: kicks planned for the candidates of each stage that adds some.
+        effort: multiplies the updates of every stage.
         seed: of the data and the training; the benchmarks use seeds below 100.
     """
     console = Console()
     remember_compilations()
     kick = prepare()
     scene, config = kick.scene, networks.COMPACT
+    random = stored_episodes(
+        folder / "random.npz", scene, lambda: random_episodes(scene, kick.reference, episodes, seed), console
+    )
+    planned: list[Episodes] = []
     learned: Weights | None = None
     rounds: list[dict[str, Any]] = []
-    random = stage(folder / "random.npz", kick, lambda: random_episodes(scene, kick.reference, episodes, seed), console)
-    planned: list[Episodes] = []
-    for number, count in enumerate(updates):
-        name = f"round{number}"
-        if number:
-            before = folder / f"round{number - 1}" / f"{WEIGHTS}.json"
-            planned.append(
-                stage(
-                    folder / f"planned{number}.npz", kick,
-                    lambda n=number, w=before: planned_episodes(kick, w, tasks, 8, seed + 1000 * n), console,
-                )
-            )  # fmt: skip
-        sources = [(random, 0.5 if planned else 1.0)] + [(part, 0.5 / len(planned)) for part in planned]
-        recipe = training.Recipe(
-            updates=count,
-            learning_rate=1e-3 if number == 0 else 4e-4,
-            loss=LossWeights(velocity=1e-3),
-            seed=seed + number,
-            curriculum=training.Recipe.curriculum if number == 0 else ((20, 1.0),),
-        )
-        manifest = folder / name / f"{WEIGHTS}.json"
+    manifest = Path()
+    for number, stage in enumerate(STAGES):
+        if stage.planned:
+            make = partial(planned_episodes, kick, manifest, tasks, 8, seed + 1000 * number)
+            planned.append(stored_episodes(folder / f"{stage.name}.npz", scene, make, console))
+        manifest = folder / stage.name / f"{WEIGHTS}.json"
         if manifest.exists():
             _, learned, content = stored.load(manifest, scene)
             rounds = content["recipe"]["rounds"]
             continue
-        learned, log = training.train(scene, config, recipe, sources, folder / name / "checkpoints", learned)
+        sources = [(random, 0.5 if planned else 1.0)] + [(part, 0.5 / len(planned)) for part in planned]
+        updates = max(1, round(effort * stage.recipe.updates))
+        recipe = dataclasses.replace(stage.recipe, updates=updates, seed=seed + number)
+        learned, log = training.train(scene, config, recipe, sources, folder / stage.name, learned)
         rounds = [
             *rounds,
             {
+                "stage": stage.name,
                 "recipe": dataclasses.asdict(recipe),
                 "sources": [{"episodes": len(source), "share": share} for source, share in sources],
                 "seconds": log["seconds"],
                 "dropped": log["dropped"],
                 "stopped_early": log["stopped_early"],
-                "sequences_per_second": log["history"][-1]["sequences_per_second"] if log["history"] else None,
+                "last": log["history"][-1] if log["history"] else None,
             },
         ]
-        stored.save(folder / name, WEIGHTS, scene, config, learned, {"rounds": rounds})
-        console.print(f"{name}: {log['seconds']:.0f} s, {log['dropped']} batches dropped")
+        stored.save(folder / stage.name, WEIGHTS, scene, config, learned, {"rounds": rounds})
+        console.print(f"{stage.name}: {log['seconds']:.0f} s, {log['dropped']} batches dropped")
     assert learned is not None
     held_out, _ = random_episodes(scene, kick.reference, 256, EVALUATION_SEED)
     scores = evaluation.evaluate(Simulator(scene, config, learned), held_out, WINDOWS)

@@ -47,6 +47,7 @@ ORDER = [
     "viewer",
     "tasks.key_poses",
     "tasks.bvh",
+    "tasks.tracking",
     "tasks.references",
     "tasks.data",
     "tasks.kick",

@@ -86,8 +86,8 @@ def save(path: Path, scene: Scene, episodes: Episodes) -> None:
 def load(path: Path, scene: Scene) -> Episodes:
     """Read episodes of this scene; refuses, by name, what is damaged or does not fit."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            header = json.loads(str(file["header"]))
+        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+            header = dict(json.loads(str(file["header"])))
             episodes = Episodes(*(file[name] for name in Episodes._fields))
     except FileNotFoundError:
         raise ValueError(f"episodes file {path} does not exist") from None

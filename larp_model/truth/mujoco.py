@@ -101,9 +101,8 @@ class Truth:
         self.model = compile_model(scene, substeps)
         self._batch = Batch(self.model, nsim=batch, nthread=threads)
         self._sensors = self._batch.bind("sensordata")  # refreshed by every call from here on
-        self._children = np.array([child for child, _, _ in scene.joints()], int)
-        self._parents = np.array([parent for _, parent, _ in scene.joints()], int)
         self._joint = {name: self.model.joint(name).id for name in self._names()}
+        self._bodies = [self.model.body(name).id for name in self._names()]  # the engine lists bodies depth first
 
     def _names(self) -> list[str]:
         return [f"{body.name}/{link.name}" for body in self.scene.bodies for link in body.links]
@@ -153,7 +152,7 @@ class Truth:
         """
         self._batch.bind("ctrl")[:] = np.asarray(control).reshape(self.batch, -1)
         if torque is not None:
-            self._batch.bind("xfrc_applied").reshape(self.batch, -1, 6)[:, 1:, 3:] = torque
+            self._batch.bind("xfrc_applied").reshape(self.batch, -1, 6)[:, self._bodies, 3:] = torque
         self._batch.step(nstep=self.substeps, stage=mujoco.mjtStage.mjSTAGE_VEL)
         return self.state()
 

@@ -1,0 +1,134 @@
+"""The kick: its reference, its report, its command line; end to end with a small budget."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from larp_model import state as packed
+from larp_model import weights as stored
+from larp_model.bodies import human_and_ball, standing_height
+from mpc import CEM
+from tasks import kick, references
+from tasks.data import random_task
+
+PROTOCOL = {
+    "target",
+    "truth_error_m",
+    "model_error_m",
+    "reference_deviation_m",
+    "ball_speed_m_s",
+    "fell",
+    "reachable",
+    "plan_seconds",
+    "replan_ms",
+    "compile_seconds",
+    "truth_rollouts",
+    "preset",
+    "dynamics",
+    "weights",
+    "seed",
+}
+
+
+@pytest.fixture(scope="module")
+def task() -> kick.Kick:
+    return kick.prepare()
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    search = (CEM(samples=32, rounds=2, elites=8),)
+    monkeypatch.setitem(kick.PRESETS, "fast", kick.Preset(search, (CEM(samples=16, rounds=1, elites=8),), every=20))
+
+
+def test_the_reference_strikes_at_a_kickers_speed_and_is_still_up_half_a_second_later(task: kick.Kick) -> None:
+    states, strike = task.reference.states, task.reference.strike
+    foot = states[:, task.foot]
+    forward = Rotation.from_quat(foot[:, packed.ORIENTATION], scalar_first=True).apply([1.0, 0.0, 0.0])
+    link = task.scene.links[task.foot]
+    to_toe = (0.5 * link.length + link.radius) * forward
+    toe = np.linalg.norm(foot[:, packed.VELOCITY] + np.cross(foot[:, packed.ANGULAR_VELOCITY], to_toe), axis=-1)
+    assert 8.0 <= toe[strike] <= 16.0
+    assert np.linalg.norm(states[strike + 8, task.ball, packed.VELOCITY]) >= 8.0
+    assert states[: strike + 51, 0, 2].min() > 0.75 * task.standing
+
+
+def test_the_standing_height_is_that_of_the_closed_up_rest_pose() -> None:
+    scene = human_and_ball()
+    state = references.standing_on_ground(scene, np.zeros((len(scene.motors), 3)), Rotation.identity())
+    assert state[0, 2] == pytest.approx(standing_height(scene.bodies[0]), abs=1e-9)
+
+
+def test_the_ball_distance_counts_the_way_between_steps() -> None:
+    path = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+    assert kick.miss(path, np.array([1.0, 0.3, 0.0])) == pytest.approx(0.3, abs=1e-6)
+    assert kick.miss(path, np.array([3.0, 0.0, 0.0])) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_tasks_are_drawn_within_the_protocols_bounds() -> None:
+    random = np.random.default_rng(0)
+    for _ in range(200):
+        target, shift = random_task(random)
+        assert 2.0 <= np.hypot(*target[:2]) <= 5.0
+        assert abs(np.degrees(np.arctan2(target[1], target[0]))) <= 25.0
+        assert 0.11 <= target[2] <= 1.0
+        assert (np.abs(shift) <= 0.03).all()
+
+
+def test_with_the_truth_as_model_what_is_predicted_happens(task: kick.Kick, small: None) -> None:
+    model, _ = kick.dynamics_of(task.scene, "mujoco", stored.SHIPPED)
+    first, again, _ = kick.planners_of(task, "fast", model)
+    target = np.array([3.0, 0.2, 0.4])
+    execution = task.run((first, again), 100, target, seed=0)
+    report = task.report(execution, target)
+    assert report["touched"]
+    assert report["truth_error_m"] == pytest.approx(report["model_error_m"], abs=0.01)
+
+
+def test_a_kick_end_to_end_leaves_all_its_files_and_they_agree(tmp_path: Path, small: None) -> None:
+    kick.main((3.0, 0.3, 0.4), preset="fast", out=tmp_path, seed=3)
+    assert {path.name for path in tmp_path.iterdir()} == {"summary.json", "kick.npz", "kick.png", "kick.html"}
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert set(summary) >= PROTOCOL
+    assert summary["truth_rollouts"] == 0
+    with np.load(tmp_path / "kick.npz", allow_pickle=False) as file:
+        path = file["states"][:, -1, :3]
+    assert kick.miss(path, np.array(summary["target"])) == pytest.approx(summary["truth_error_m"], abs=1e-3)
+
+
+def test_a_target_out_of_reach_is_marked_and_still_gets_a_plan(task: kick.Kick, small: None) -> None:
+    model, _ = kick.dynamics_of(task.scene, "larp", stored.SHIPPED / f"{kick.WEIGHTS}.json")
+    first, again, every = kick.planners_of(task, "fast", model)
+    target = np.array([0.0, 0.0, 40.0])
+    report = task.report(task.run((first, again), every, target, seed=0), target)
+    assert not report["reachable"]
+    assert np.isfinite(report["truth_error_m"])
+
+
+@pytest.mark.parametrize(
+    ("argument", "values"),
+    [
+        ("preset", {"preset": "heroic"}),
+        ("dynamics", {"dynamics": "wishful"}),
+        ("target", {"target": (float("nan"), 0.0, 0.0)}),
+        ("reference", {"reference": Path("nowhere.bvh")}),
+        ("weights", {"weights": Path("nowhere.json")}),
+    ],
+)
+def test_wrong_values_end_with_one_line_that_names_them_and_code_2(
+    argument: str, values: dict[str, object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def task() -> None:
+        kick.main(**{"out": tmp_path / "out"} | values)  # type: ignore[arg-type]
+
+    with pytest.raises(SystemExit) as ended:
+        kick.run(task, arguments=[])
+    assert ended.value.code == 2
+    line = capsys.readouterr().err.strip()
+    assert "\n" not in line and argument in line
+    assert not (tmp_path / "out").exists()
