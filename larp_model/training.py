@@ -205,7 +205,7 @@ def train(
             states = features.turn_states(states, turn[:, None])
             torques = features.rotation.about_z(torques, turn[:, None, None])
         (loss, terms), gradient = jax.value_and_grad(loss_of, has_aux=True)(networks, states, controls, torques)
-        norm = optax.global_norm(gradient)
+        norm = optax.tree.norm(gradient)
         good = jnp.isfinite(norm) & (norm < recipe.drop)
         gradient = jax.tree.map(lambda g: jnp.where(good, g, 0.0), gradient)
         changes, new_state = transform.update(gradient, state, networks)
@@ -218,7 +218,7 @@ def train(
 
     log: dict[str, Any] = {"history": [], "dropped": 0, "stopped_early": False, "seconds": 0.0}
     in_a_row, recent, begin, saved = 0, [], time.perf_counter(), time.perf_counter()
-    networks, state = progressed.networks, progressed.optimiser
+    networks, state = jax.tree.map(jnp.copy, progressed.networks), progressed.optimiser  # `update` consumes them
     first = int(progressed.update)
     columns = (
         TextColumn("training"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"),
@@ -236,7 +236,8 @@ def train(
             in_a_row = in_a_row + 1 if values["dropped"] else 0
             if (index + 1) % 100 == 0 or index + 1 == recipe.updates:
                 now = time.perf_counter()
-                mean = {name: float(np.nanmean([row[name] for row in recent])) for name in values}
+                sound = [row for row in recent if np.isfinite(row["loss"])] or recent
+                mean = {name: float(np.mean([row[name] for row in sound])) for name in values}
                 rate = (index + 1 - first) * recipe.batch / (now - begin)
                 log["history"].append(
                     {"update": index + 1, "unroll": recipe.unroll(index), **mean, "sequences_per_second": rate}

@@ -58,7 +58,7 @@ def unflatten(arrays: Mapping[str, np.ndarray]) -> Weights:
     return Weights(
         tree["networks"],
         {name: Statistics(**value) for name, value in tree["inputs"].items()},
-        {name: Statistics(**value) for name, value in tree["outputs"].items()},
+        {name: Statistics(**value) for name, value in tree.get("outputs", {}).items()},
     )
 
 
@@ -95,12 +95,13 @@ def load(manifest: Path, scene: Scene) -> tuple[Config, Weights, dict[str, Any]]
         if not path.is_file():
             raise ValueError(f"weights file {path} does not exist")
     try:
-        content = json.loads(manifest.read_text())
-        config = Config(**content["config"])
-        expected, version, made_for = content["sha256"], content["version"], content["scene"]
+        content = dict(json.loads(manifest.read_text()))
+        version = content["version"]
+        config = Config(**content["config"]) if version == VERSION else None
+        expected, made_for = content["sha256"], content["scene"]
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"weights manifest {manifest} cannot be read: {type(error).__name__}: {error}") from None
-    if version != VERSION:
+    if config is None:
         raise ValueError(f"weights {manifest} are of version {version!r}, but {VERSION} is needed")
     if made_for != signature(scene):
         raise ValueError(f"weights {manifest} were made for scene {made_for!r}, but this scene is {signature(scene)!r}")

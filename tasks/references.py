@@ -104,8 +104,9 @@ def embedded(scene: Scene, steps: int = 300) -> Reference:
 def captured(path: str | Path, scene: Scene, seconds_before: float = 0.6, seconds_after: float = 1.0) -> Reference:
     """A captured kick (BVH), performed in the truth by the human of `scene`, who follows the clip around its strike.
 
-    It is turned so that the ball leaves along x, and mirrored if its kicking foot is the left. The ball waits where
-    the foot, as performed, would strike it hardest. ValueError where the file is not understood or no ball is hit.
+    The ball waits where the foot, as performed, would strike it hardest. The whole is turned and moved so that the
+    ball leaves along the x axis (the human starts beside it), and mirrored if the kicking foot is the left.
+    ValueError where the file is not understood, is no kick, or no ball is hit.
     """
     for name, value in (("seconds_before", seconds_before), ("seconds_after", seconds_after)):
         if not 0.2 <= value <= 10.0:
@@ -135,7 +136,7 @@ def captured(path: str | Path, scene: Scene, seconds_before: float = 0.6, second
 
 
 def _launched_along_x(states: np.ndarray, strike: int) -> np.ndarray:
-    """The states (T, L, 13), turned about z so that the ball leaves along x."""
+    """The states (T, L, 13), turned about z and moved along y so that the ball leaves along the x axis."""
     x, y, _ = states[min(strike + MEETING, len(states) - 1), -1, packed.VELOCITY]
     turn = Rotation.from_rotvec((0.0, 0.0, -np.arctan2(y, x)))
     turned = states.copy()
@@ -143,6 +144,7 @@ def _launched_along_x(states: np.ndarray, strike: int) -> np.ndarray:
         turned[..., columns] = turn.apply(states[..., columns].reshape(-1, 3)).reshape(*states.shape[:2], 3)
     orientation = turn * Rotation.from_quat(states[..., packed.ORIENTATION].reshape(-1, 4), scalar_first=True)
     turned[..., packed.ORIENTATION] = orientation.as_quat(scalar_first=True).reshape(*states.shape[:2], 4)
+    turned[..., 1] -= turned[0, -1, 1]
     return turned
 
 

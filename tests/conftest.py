@@ -1,7 +1,71 @@
-"""Settings shared by all tests."""
+"""Settings and fixtures shared by all tests."""
 
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
 from hypothesis import settings
+
+from larp_model.bodies import human_and_ball
+from larp_model.networks import Config
+from larp_model.scene import Scene
+from larp_model.simulator import Weights
+from larp_model.training import Recipe, Windows, statistics_of
+from larp_model.truth.episodes import Episodes
+from tasks.data import random_episodes
+from tasks.references import Reference, embedded
 
 # The first example of a property pays for compilation: no deadline. Every run tries the same examples.
 settings.register_profile("repeatable", deadline=None, derandomize=True)
 settings.load_profile("repeatable")
+
+
+@pytest.fixture(scope="session")
+def scene() -> Scene:
+    """The kick's scene."""
+    return human_and_ball()
+
+
+@pytest.fixture(scope="session")
+def reference(scene: Scene) -> Reference:
+    """The embedded kick."""
+    return embedded(scene)
+
+
+@pytest.fixture(scope="session")
+def episodes(scene: Scene, reference: Reference) -> Episodes:
+    """64 truth episodes of 30 steps around the reference; in about half of them a foot meets the ball."""
+    return random_episodes(scene, reference, count=64, seed=0, steps=30)[0]
+
+
+@pytest.fixture(scope="session")
+def compact() -> Config:
+    """The shipped kind of model, as small as it can be."""
+    return Config("tiny", 2, 16, 2, 16, 2, 16, "heading", "change", "impulse", skip=True)
+
+
+@pytest.fixture(scope="session")
+def paper() -> Config:
+    """The paper's kind of model, as small as it can be."""
+    return Config("tiny_paper", 2, 16, 2, 16, 2, 16, "world", "velocity", "feature", skip=False)
+
+
+def random_weights(scene: Scene, config: Config, episodes: Episodes) -> Weights:
+    """Untrained weights whose last layers are large enough that every input matters."""
+    with jax.enable_x64(False):
+        windows = Windows(scene, [(episodes, 1.0)], Recipe(batch=64))
+        fresh = statistics_of(scene, config, windows, np.random.default_rng(0), batches=2)
+        return fresh._replace(networks=jax.tree.map(lambda leaf: 2.0 * leaf, fresh.networks))
+
+
+@pytest.fixture(scope="session")
+def compact_weights(scene: Scene, compact: Config, episodes: Episodes) -> Weights:
+    """Random weights of `compact`."""
+    return random_weights(scene, compact, episodes)
+
+
+@pytest.fixture(scope="session")
+def paper_weights(scene: Scene, paper: Config, episodes: Episodes) -> Weights:
+    """Random weights of `paper`."""
+    return random_weights(scene, paper, episodes)

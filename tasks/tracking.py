@@ -1,0 +1,63 @@
+"""Tracking: the servo-driven human follows a wanted motion in the truth, under joint targets that a planner finds.
+
+    minimise over theta   mean_t sum_i w_i |x_i(t) - x_i^wanted(t)|^2    links are where they are wanted
+    subject to            S_{t+1} = truth(S_t, Q_t),  Q = Q^wanted + spline(theta)
+
+Captured joint angles alone do not keep a free body up: its size and its ground are not the captured person's.
+"""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+from jax import Array
+
+from larp_model import state as packed
+from larp_model.scene import Scene
+from larp_model.truth.mujoco import Truth
+from mpc import CEM, CostTerm, MujocoDynamics, Planner, quadratic
+from mpc.loop import Window, execute
+
+HORIZON = 30
+KNOTS = 7
+EVERY = 4
+OPTIMIZER = CEM(samples=64, rounds=2, elites=12)
+# The planner's own truth: engine steps in a control step, enough to stand on, and simulations side by side.
+SUBSTEPS, ROWS = 4, 32
+# Standard deviation of the joint targets tried, as a share of the motors' range.
+SPREAD = 0.1
+
+
+class Tracker:
+    """Follows the positions of wanted states (T, L, 13), weighted (T, L), from joint targets (T, J, 3) [rad] on."""
+
+    def __init__(self, scene: Scene, wanted: np.ndarray, weights: np.ndarray, controls: np.ndarray) -> None:
+        self.scene, self.controls = scene, controls
+        self.wanted, self.weights = wanted[..., packed.POSITION], np.sqrt(weights)[..., None]
+
+        def apart(states: Array, controls: Array, context: tuple[Array, Array]) -> Array:
+            wanted, weights = context
+            return (weights * (states[..., packed.POSITION] - wanted)).reshape(len(states), -1)
+
+        bounds = np.array([(motor.lower, motor.upper) for motor in scene.motors])
+        lower, upper = bounds[:, 0], bounds[:, 1]
+        self.planner = Planner(
+            MujocoDynamics(Truth(scene, ROWS, SUBSTEPS)), [CostTerm("apart", apart, quadratic)], HORIZON, KNOTS,
+            scene.dt, SPREAD * (upper - lower), OPTIMIZER, lower, upper,
+        )  # fmt: skip
+
+    def follow(self, state: np.ndarray, begin: int, end: int) -> tuple[np.ndarray, np.ndarray]:
+        """From `state` (L, 13) at step `begin` to step `end`, in the truth.
+
+        Returns the states (end - begin + 1, L, 13), `state` first, and the joint targets (end - begin, J, 3) [rad].
+        """
+
+        def window(step: int) -> Window:
+            rows = np.minimum(begin + step + np.arange(HORIZON + 1), len(self.wanted) - 1)
+            return Window(self.controls[rows[:-1]], (self.wanted[rows[1:]], self.weights[rows[1:]]))
+
+        execution = execute(
+            Truth(self.scene), state, self.planner, self.planner, window, end - begin, EVERY,
+            lambda current: bool(np.isfinite(current).all()), jax.random.key(0), self.scene.dt,
+        )  # fmt: skip
+        return np.array(execution.states), np.array(execution.controls)

@@ -1,0 +1,321 @@
+"""BVH files: forward kinematics, refusals, mirroring, retargeting; with captured clips where they are at hand."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from larp_model.bodies import human
+from larp_model.scene import Scene
+from tasks import bvh
+from tasks.benchmarks import reference as benchmark
+from tasks.references import captured
+
+CLIPS = Path(__file__).parents[2] / "shared" / "mocap"
+with_clips = pytest.mark.skipif(not CLIPS.is_dir(), reason="no captured clips in ../shared/mocap")
+
+# A skeleton in centimetres, y up, facing z: joint, parent, offset.
+SKELETON = [
+    ("Hips", None, (0, 0, 0)),
+    ("Spine", "Hips", (0, 15, 0)),
+    ("Head", "Spine", (0, 45, 0)),
+    *(
+        joint
+        for side, x in (("Left", 1), ("Right", -1))
+        for joint in (
+            (f"{side}Arm", "Spine", (18 * x, 35, 0)),
+            (f"{side}ForeArm", f"{side}Arm", (28 * x, 0, 0)),
+            (f"{side}Hand", f"{side}ForeArm", (25 * x, 0, 0)),
+            (f"{side}UpLeg", "Hips", (9 * x, -8, 0)),
+            (f"{side}Leg", f"{side}UpLeg", (0, -40, 0)),
+            (f"{side}Foot", f"{side}Leg", (0, -42, 0)),
+            (f"{side}ToeBase", f"{side}Foot", (0, -5, 14)),
+        )
+    ),
+]
+NAMES = [name for name, _, _ in SKELETON]
+THIGH, SHIN = 0.40, 0.42
+Turns = dict[str, tuple[float, float, float]]
+
+
+def text(*frames: Turns, place: tuple[float, float, float] = (0.0, 95.0, 0.0)) -> str:
+    """The skeleton as BVH; a frame gives joints' angles about z, y, x [deg], in this order."""
+
+    def branch(name: str) -> str:
+        offset = next(offset for joint, _, offset in SKELETON if joint == name)
+        position = "" if name != "Hips" else "Xposition Yposition Zposition "
+        children = [joint for joint, parent, _ in SKELETON if parent == name]
+        inner = "".join(f"JOINT {child}\n{branch(child)}" for child in children)
+        inner = inner or "End Site\n{\nOFFSET 0 0 5\n}\n"
+        channels = f"CHANNELS {6 if position else 3} {position}Zrotation Yrotation Xrotation\n"
+        return f"{{\nOFFSET {' '.join(map(str, offset))}\n{channels}{inner}}}\n"
+
+    hierarchy = f"HIERARCHY\nROOT Hips\n{branch('Hips')}"
+    order = [word for word in hierarchy.split() if word in NAMES]
+    rows = [
+        " ".join(map(str, (*place, *(angle for name in order for angle in frame.get(name, (0, 0, 0))))))
+        for frame in frames
+    ]
+    return f"{hierarchy}MOTION\nFrames: {len(rows)}\nFrame Time: 0.01\n" + "\n".join(rows) + "\n"
+
+
+# Arms down at the sides: the human's rest pose.
+STANDING: Turns = {"LeftArm": (-90, 0, 0), "RightArm": (90, 0, 0)}
+
+
+@pytest.fixture
+def load(tmp_path: Path) -> Callable[[str], bvh.Motion]:
+    """Reads a motion from text."""
+
+    def from_text(content: str) -> bvh.Motion:
+        path = tmp_path / "clip.bvh"
+        path.write_text(content, encoding="utf-8")
+        return bvh.load(path)
+
+    return from_text
+
+
+def swing(frames: int, side: str = "Right") -> list[Turns]:
+    """Somebody whose thigh swings forwards, fastest in the middle; first the T-pose."""
+    angles = 60.0 * np.tanh(np.linspace(-3.0, 3.0, frames))
+    return [{}, *(STANDING | {f"{side}UpLeg": (0.0, 0.0, -angle), f"{side}Leg": (0.0, 0.0, 20.0)} for angle in angles)]
+
+
+@given(thigh=st.floats(-90, 90), roll=st.floats(-40, 40), shin=st.floats(0, 120), heading=st.floats(-180, 180))
+def test_forward_kinematics_of_a_leg(
+    tmp_path_factory: pytest.TempPathFactory, thigh: float, roll: float, shin: float, heading: float
+) -> None:
+    path = tmp_path_factory.mktemp("leg") / "leg.bvh"
+    frame = {"Hips": (0.0, heading, 0.0), "LeftUpLeg": (roll, 0.0, thigh), "LeftLeg": (0.0, 0.0, shin)}
+    path.write_text(text({}, frame, place=(30.0, 95.0, -20.0)))
+    motion = bvh.load(path)
+    pelvis = Rotation.from_euler("z", heading, degrees=True)
+    hip = np.array([-0.20, 0.30, 0.95]) + pelvis.apply([0.0, 0.09, -0.08])
+    upper = pelvis * Rotation.from_euler("XY", [roll, thigh], degrees=True)
+    knee = hip + upper.apply([0.0, 0.0, -THIGH])
+    ankle = knee + (upper * Rotation.from_euler("y", shin, degrees=True)).apply([0.0, 0.0, -SHIN])
+    assert motion.rate == pytest.approx(100.0)
+    for joint, expected in (("LeftUpLeg", hip), ("LeftLeg", knee), ("LeftFoot", ankle)):
+        np.testing.assert_allclose(motion.path(joint), [expected], atol=1e-9)
+
+
+def test_positions_follow_from_orientations_and_offsets(load: Callable[[str], bvh.Motion]) -> None:
+    motion = load(text(*swing(20)))
+    for child, parent in enumerate(motion.parents[1:], start=1):
+        bone = motion.rotation(motion.names[parent]).apply(motion.offsets[child])
+        np.testing.assert_allclose(motion.positions[:, child], motion.positions[:, parent] + bone, atol=1e-9)
+
+
+def test_first_frame_is_left_out_only_if_it_is_a_t_pose(load: Callable[[str], bvh.Motion]) -> None:
+    assert len(load(text({}, STANDING, STANDING)).positions) == 2
+    assert len(load(text(STANDING, STANDING, STANDING)).positions) == 3
+
+
+@pytest.mark.parametrize("heading", [0.0, 70.0])
+def test_rest_pose_may_face_anywhere(load: Callable[[str], bvh.Motion], heading: float) -> None:
+    turned = {"Hips": (0.0, heading, 0.0)}
+    motion = load(text(turned, turned | STANDING))
+    expected = Rotation.from_euler("z", heading, degrees=True).as_matrix()
+    np.testing.assert_allclose(motion.rotation("Hips").as_matrix(), [expected], atol=1e-12)
+
+
+GOOD = text({}, STANDING, STANDING)
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ("", "HIERARCHY"),
+        ("a picture\n", "HIERARCHY"),
+        (GOOD.replace("MOTION", "NOTION"), "MOTION"),
+        (GOOD.replace("Frames: 3", "Frames: many"), "frames"),
+        (GOOD.replace("Frames: 3", "Frames: 4"), "3 frames, but announces 4"),
+        (GOOD[: GOOD.index("Frame Time")] + "Frame Time: 0.01\n", "no frames"),
+        (text({}), "no frames but the T-pose"),
+        (GOOD.replace("0.01", "0"), "Frame Time"),
+        (GOOD.replace("95.0", "nan", 1), "not finite"),
+        (GOOD.replace("95.0", "1e300", 1), "not finite"),
+        (GOOD.replace("95.0", "up", 1), "not a number"),
+        (GOOD.replace("95.0", "", 1), "columns"),
+        (GOOD.replace("OFFSET 0 15 0", "OFFSET 0 15"), "Spine"),
+        (GOOD.replace("Xposition", "Xscale"), "channels"),
+        (GOOD.replace("Zrotation Yrotation", "Zrotation Zrotation", 1), "channels"),
+        (GOOD.replace("CHANNELS 3", "CHANNELS 6", 1), "channels"),
+        (GOOD.replace("RightToeBase", "RightToes"), "RightToeBase"),
+        (GOOD.replace("LeftUpLeg", "LeftThigh").replace("Head", "Hat"), "Head, LeftUpLeg"),
+        (GOOD.replace("}", "", 1), "HIERARCHY"),
+        (GOOD.replace("Hips", "x").replace("LeftArm", "Hips").replace("x", "LeftArm", 1), "no chest"),
+        (GOOD.replace("RightHand", "LeftHand"), "two joints of one name"),
+        (GOOD.replace("OFFSET 0 -40 0", "OFFSET 0 -400 0"), "units"),
+        (text({"Hips": (90, 0, 0)}, {}).replace("OFFSET 28 0 0", "OFFSET 0 0 28"), "T-pose"),
+    ],
+)
+def test_refused_in_one_line(load: Callable[[str], bvh.Motion], content: str, expected: str) -> None:
+    with pytest.raises(ValueError, match=expected) as refusal:
+        load(content)
+    assert str(refusal.value).startswith("clip.bvh ") and "\n" not in str(refusal.value)
+
+
+def test_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"path is .*none\.bvh.* no such file"):
+        bvh.load(tmp_path / "none.bvh")
+
+
+@pytest.fixture(scope="module")
+def damaged(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("damaged") / "clip.bvh"
+
+
+def load_or_refuse(path: Path, content: bytes) -> None:
+    path.write_bytes(content)
+    try:
+        motion = bvh.load(path)
+    except ValueError:
+        return
+    assert np.isfinite(motion.positions).all() and np.isfinite(motion.orientations).all()
+
+
+@given(end=st.integers(0, len(GOOD)))
+def test_truncated_files_are_read_or_refused(damaged: Path, end: int) -> None:
+    load_or_refuse(damaged, GOOD.encode()[:end])
+
+
+@given(bits=st.lists(st.integers(0, 8 * len(GOOD) - 1), min_size=1, max_size=8))
+def test_files_with_flipped_bits_are_read_or_refused(damaged: Path, bits: list[int]) -> None:
+    content = bytearray(GOOD.encode())
+    for bit in bits:
+        content[bit // 8] ^= 1 << bit % 8
+    load_or_refuse(damaged, bytes(content))
+
+
+def test_mirroring_twice_changes_nothing(load: Callable[[str], bvh.Motion]) -> None:
+    motion = load(text(*swing(10)))
+    again = bvh.mirrored(bvh.mirrored(motion))
+    assert again.names == motion.names
+    for field in ("offsets", "positions", "orientations"):
+        np.testing.assert_array_equal(getattr(again, field), getattr(motion, field))
+
+
+def test_mirroring_a_right_swing_gives_the_left_one(load: Callable[[str], bvh.Motion]) -> None:
+    right, left = load(text(*swing(10))), load(text(*swing(10, "Left")))
+    assert (bvh.kicking_side(right), bvh.kicking_side(left)) == ("Right", "Left")
+    mirrored = bvh.mirrored(left)
+    for name in NAMES:
+        np.testing.assert_allclose(mirrored.path(name), right.path(name), atol=1e-9)
+    (_, expected), (_, vectors) = (bvh.retarget(motion, human(), 0.01) for motion in (right, mirrored))
+    np.testing.assert_allclose(vectors, expected, atol=1e-9)
+
+
+def test_standing_retargets_to_no_rotation(load: Callable[[str], bvh.Motion]) -> None:
+    root, vectors = bvh.retarget(load(text({}, *[STANDING] * 5)), human(), 0.01)
+    assert root.shape == (5, 4) and vectors.shape == (5, 12, 3)
+    np.testing.assert_allclose(np.abs(root), [[1.0, 0.0, 0.0, 0.0]] * 5, atol=1e-9)
+    np.testing.assert_allclose(vectors, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("joint", "angles", "link", "expected"),
+    [
+        ("RightLeg", (0, 0, 50), "right_shin", (0.0, np.radians(50), 0.0)),
+        ("LeftUpLeg", (0, 0, -40), "left_thigh", (0.0, -np.radians(40), 0.0)),
+        ("LeftForeArm", (0, -60, 0), "left_lower_arm", (0.0, -np.radians(60), 0.0)),
+        ("RightForeArm", (0, 60, 0), "right_lower_arm", (0.0, -np.radians(60), 0.0)),
+        ("RightFoot", (0, 0, 20), "right_foot", (0.0, np.radians(20), 0.0)),
+        ("Spine", (0, 30, 0), "torso", (0.0, 0.0, np.radians(30))),
+    ],
+)
+def test_a_turned_joint_turns_its_link_alone(
+    load: Callable[[str], bvh.Motion],
+    joint: str,
+    angles: tuple[float, float, float],
+    link: str,
+    expected: tuple[float, float, float],
+) -> None:
+    body, frame = human(), STANDING | {joint: angles}
+    _, vectors = bvh.retarget(load(text({}, frame, frame)), body, 0.01)
+    wanted = np.zeros((12, 3))
+    wanted[body.link(link) - 1] = expected
+    np.testing.assert_allclose(vectors, [wanted] * 2, atol=1e-9)
+
+
+def test_joint_targets_stay_within_the_motors_bounds(load: Callable[[str], bvh.Motion]) -> None:
+    bent = STANDING | {"RightLeg": (0.0, 0.0, 170.0), "LeftUpLeg": (0.0, 0.0, 120.0)}
+    _, vectors = bvh.retarget(load(text({}, bent, bent)), human(), 0.01)
+    for row, (_, _, motor) in enumerate(human().motors):
+        assert (vectors[:, row] >= motor.lower).all() and (vectors[:, row] <= motor.upper).all()
+
+
+@pytest.mark.parametrize("dt", [0.004, 0.01, 0.02])
+def test_retargeting_resamples(load: Callable[[str], bvh.Motion], dt: float) -> None:
+    _, vectors = bvh.retarget(load(text(*swing(41))), human(), dt)
+    assert len(vectors) == round(0.4 / dt) + 1
+
+
+def test_strike_is_where_the_toe_is_fastest(load: Callable[[str], bvh.Motion]) -> None:
+    motion = load(text(*swing(61)))
+    assert bvh.strike(motion) == 30
+    radius = np.linalg.norm((motion.path("RightToeBase") - motion.path("RightUpLeg"))[30])
+    rate = np.radians(60.0) * 6.0 / 60.0 * motion.rate  # slope of 60 tanh(x) at 0, x from -3 to 3 in 60 frames
+    assert bvh.toe_speed(motion).max() == pytest.approx(radius * rate, rel=0.03)
+
+
+def test_speeds_need_frames(load: Callable[[str], bvh.Motion]) -> None:
+    with pytest.raises(ValueError, match="frames"):
+        bvh.toe_speed(load(GOOD))
+
+
+def test_a_motion_without_a_kick_is_no_reference(tmp_path: Path, scene: Scene) -> None:
+    path = tmp_path / "standing.bvh"
+    path.write_text(text({}, *[STANDING] * 20))
+    with pytest.raises(ValueError, match="is no kick"):
+        captured(path, scene)
+    with pytest.raises(ValueError, match="seconds_before"):
+        captured(path, scene, seconds_before=0.0)
+
+
+def test_benchmark_compares_clips_with_the_embedded_kick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # where RESULTS.md and runs/ are written
+    with pytest.raises(ValueError, match="clips is"):
+        benchmark.main(clips=tmp_path)
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "swing.bvh").write_text(text(*swing(121, "Left")))
+    benchmark.main(clips=tmp_path)
+    found = json.loads(Path("runs/benchmarks/reference.json").read_text())
+    assert [(row["name"], row["kind"]) for row in found["rows"]] == [("embedded", "kick"), ("swing", "walk")]
+    assert found["rows"][1]["knee_strike_deg"] == pytest.approx(20.0)
+    assert Path("runs/benchmarks/reference.png").stat().st_size > 10_000
+    assert "| swing | walk |" in Path("RESULTS.md").read_text()
+
+
+# Peak speeds of the right toe [m/s]: from frame to frame, and smoothed. Where they differ much, a marker jumps.
+CAPTURED = {"10_01": (11.4, 10.9), "10_02": (12.8, 12.3), "10_05": (15.6, 11.4), "10_04": (6.1, 4.2)}
+
+
+@with_clips
+@pytest.mark.parametrize("name", CAPTURED)
+def test_captured_toe_speeds(name: str) -> None:
+    raw, smooth = CAPTURED[name]
+    motion = bvh.load(CLIPS / f"{name}.bvh")
+    steps = np.linalg.norm(np.diff(motion.path("RightToeBase"), axis=0), axis=-1)
+    assert (motion.rate, bvh.kicking_side(motion)) == (pytest.approx(120.0, rel=1e-3), "Right")
+    assert motion.hip_height == pytest.approx(1.0, rel=0.1)
+    assert steps.max() * motion.rate == pytest.approx(raw, rel=0.1)
+    assert bvh.toe_speed(motion).max() == pytest.approx(smooth, rel=0.1)
+
+
+@with_clips
+def test_a_captured_kick_strikes_the_ball(scene: Scene) -> None:
+    reference = captured(CLIPS / "10_01.bvh", scene, seconds_before=0.6, seconds_after=0.2)
+    steps = len(reference.controls)
+    assert reference.states.shape == (steps + 1, len(scene.links), 13)
+    before, after = reference.states[reference.strike, -1], reference.states[reference.strike + 5, -1]
+    np.testing.assert_allclose(before[:3], reference.ball_spot, atol=0.01)
+    assert after[7] > 5.0 and abs(after[8]) < 0.1 * after[7]
+    assert reference.ball_spot[1] == pytest.approx(0.0)

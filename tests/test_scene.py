@@ -1,0 +1,181 @@
+"""Scene descriptions: hashable, scaled as promised, and loud about nonsense."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from larp_model import features
+from larp_model.bodies import ball, capsule, chain, human, human_and_ball, standing_height
+from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface, anchor
+
+NAN, INFINITY = math.nan, math.inf
+LINK, SURFACE = Link("link", 0.3, 0.05, 1.0), Surface(1e4, 10.0, 0.5)
+MOTOR = Motor(100.0, 5.0, 50.0, (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+JOINT = Joint(0, (0.0, 0.0, 1.0), (0.0, 0.0, -1.0))
+PAIR = Pair("human", "ball", ("left_foot",), ("ball",), SURFACE)
+
+
+@pytest.mark.parametrize(
+    ("description", "field", "value"),
+    [
+        (LINK, "length", -0.1),
+        (LINK, "length", NAN),
+        (LINK, "radius", 0.0),
+        (LINK, "radius", INFINITY),
+        (LINK, "mass", 0.0),
+        (LINK, "mass", -1.0),
+        (LINK, "axis", (0.0, 0.0, 2.0)),
+        (LINK, "axis", (0.0, 1.0)),
+        (LINK, "axis", (NAN, 0.0, 1.0)),
+        (MOTOR, "stiffness", 0.0),
+        (MOTOR, "damping", -1.0),
+        (MOTOR, "torque_limit", 0.0),
+        (MOTOR, "lower", (2.0, 0.0, 0.0)),
+        (MOTOR, "upper", (1.0, INFINITY, 1.0)),
+        (JOINT, "parent_anchor", (0.0, 0.0)),
+        (JOINT, "child_anchor", (0.0, 0.0, NAN)),
+        (JOINT, "damping", -0.1),
+        (SURFACE, "stiffness", 0.0),
+        (SURFACE, "damping", -1.0),
+        (SURFACE, "friction", -0.5),
+        (human_and_ball(), "dt", 0.0),
+        (human_and_ball(), "dt", NAN),
+        (human_and_ball(), "gravity", -9.81),
+    ],
+)
+def test_a_description_refuses_nonsense_by_field(description: Link, field: str, value: object) -> None:
+    with pytest.raises(ValueError, match=rf"\.{field} is .*but must ") as caught:
+        dataclasses.replace(description, **{field: value})  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: Body("b", "b", ()), "'b' has no links"),
+        (lambda: Body("b", "b", (LINK,), (JOINT,)), "'b' has 1 joints"),
+        (lambda: Body("b", "b", (LINK, dataclasses.replace(LINK, name="x")), (Joint(1, *[(0.0, 0.0, 0.0)] * 2),)),
+         "parent of link 1 is 1"),
+        (lambda: Body("b", "b", (LINK, LINK), (JOINT,)), "link names"),
+        (lambda: Scene(()), "scene.bodies"),
+        (lambda: Scene((ball(), ball())), "scene.bodies"),
+        (lambda: Scene((human(), ball()), (dataclasses.replace(PAIR, first="robot"),)), "no body 'robot'"),
+        (lambda: Scene((human(), ball()), (dataclasses.replace(PAIR, first_links=("paw",)),)), "no link 'paw'"),
+        (lambda: Scene((human(), ball()), (dataclasses.replace(PAIR, second_links=()),)), "no link of 'ball'"),
+        (lambda: Scene((ball(),), (Pair("ball", "ball", ("ball",), ("ball",), SURFACE),)), "'ball' twice"),
+        (lambda: human_and_ball().only("robot"), "no body 'robot'"),
+        (lambda: human_and_ball().index("human", "paw"), "no link 'paw'"),
+        (lambda: Surface.bouncing(0.0, 0.8, 0.5), "contact_time is 0.0"),
+        (lambda: Surface.bouncing(0.01, 1.2, 0.5), "restitution is 1.2"),
+        (lambda: ball(radius=-0.1), "radius is -0.1"),
+        (lambda: ball(mass=NAN), "mass is nan"),
+        (lambda: capsule(length=0.0), "length is 0.0"),
+        (lambda: chain(links=0), "links is 0"),
+        (lambda: human(height=-1.75), "height is -1.75"),
+        (lambda: human(mass=0.0), "mass is 0.0"),
+        (lambda: human(lengths={"tail": 1.0}), "lengths names 'tail'"),
+        (lambda: human(radii={"shin": 0.0}), "radii"),
+        (lambda: human_and_ball(dt=-0.01), "dt is -0.01"),
+    ],
+)  # fmt: skip
+def test_a_builder_refuses_nonsense_by_name(build: Callable[[], object], message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        build()
+    assert "\n" not in str(caught.value)
+
+
+def test_equal_descriptions_are_one_key() -> None:
+    assert human_and_ball() == human_and_ball() and hash(human_and_ball()) == hash(human_and_ball())
+    scenes = {human_and_ball(): 1, human_and_ball(mass=71.0): 2, human_and_ball(dt=0.005): 3}
+    assert scenes[human_and_ball()] == 1 and len(scenes) == 3
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        human_and_ball().dt = 0.02  # type: ignore[misc]
+
+
+def test_rows_of_bodies_tile_the_state_and_the_control() -> None:
+    scene = Scene((chain("first"), human(), ball(), chain("last", links=2)))
+    for rows, total in ((scene.rows, len(scene.links)), (scene.motor_rows, len(scene.motors))):
+        covered = [row for body in scene.bodies for row in range(total)[rows(body.name)]]
+        assert covered == list(range(total))
+    for row, link in enumerate(scene.links[4:17], start=4):
+        assert scene.index("human", link.name) == row
+    for child, parent, joint in scene.joints():
+        assert parent < child and joint in next(b for b in scene.bodies if scene.links[child] in b.links).joints
+
+
+def test_only_keeps_the_bodies_named_and_their_pairs() -> None:
+    scene = human_and_ball()
+    assert scene.only("human", "ball") == scene
+    alone = scene.only("human")
+    assert alone.bodies == (human(),) and alone.pairs == ()
+    assert (alone.dt, alone.gravity) == (scene.dt, scene.gravity)
+
+
+FACTOR = st.floats(0.5, 2.0)
+
+
+@given(FACTOR, FACTOR)
+def test_anchors_scale_with_the_morphology(length: float, radius: float) -> None:
+    for link, point in ((Link("pelvis", 0.14, 0.1, 5.0, (0.0, 1.0, 0.0)), (0.1, 1.25, -0.3)), (LINK, (0.4, 0.5, 1.0))):
+        still = anchor(point, np.array(link.length), np.array(link.radius), link.axis)
+        scaled = anchor(point, np.array(length * link.length), np.array(radius * link.radius), link.axis)
+        along = np.abs(link.axis) > 0.5
+        np.testing.assert_allclose(scaled, np.where(along, length, radius) * still, atol=1e-12)
+        shape = jnp.array([[length * link.length, radius * link.radius, link.mass]])
+        np.testing.assert_allclose(features.anchors([point], [link.axis], shape)[0], scaled, atol=1e-6)
+
+
+@given(st.floats(1.2, 2.2), st.floats(30.0, 150.0))
+def test_a_human_has_its_mass_and_stands_on_its_height(height: float, mass: float) -> None:
+    body = human(height=height, mass=mass)
+    assert sum(link.mass for link in body.links) == pytest.approx(mass, rel=1e-3)
+    assert standing_height(body) == pytest.approx(standing_height(human()) * height / 1.75)
+    assert 0.5 * height < standing_height(body) < 0.6 * height
+
+
+def test_a_human_is_as_tall_as_it_says() -> None:
+    body = human()
+    top = standing_height(body)
+    for child in (1, 2):
+        joint, parent = body.joints[child - 1], body.links[body.joints[child - 1].parent]
+        up = anchor(joint.parent_anchor, np.array(parent.length), np.array(parent.radius), parent.axis)
+        down = anchor(joint.child_anchor, np.array(body.links[child].length), np.array(body.links[child].radius),
+                      body.links[child].axis)  # fmt: skip
+        top += up[2] - down[2]
+    head = body.links[body.link("head")]
+    assert top + 0.5 * head.length + head.radius == pytest.approx(1.75, rel=0.06)
+
+
+def test_the_right_side_mirrors_the_left() -> None:
+    body = human()
+    for child, joint, motor in body.motors:
+        name = body.links[child].name
+        if not name.startswith("left_"):
+            continue
+        other = body.link(name.replace("left_", "right_"))
+        twin = body.joints[other - 1]
+        assert twin.motor is not None
+        assert dataclasses.replace(body.links[other], name=name) == body.links[child]
+        np.testing.assert_allclose(twin.parent_anchor, np.multiply(joint.parent_anchor, (1.0, -1.0, 1.0)))
+        np.testing.assert_allclose(twin.motor.lower, [-motor.upper[0], motor.lower[1], -motor.upper[2]])
+
+
+@given(FACTOR)
+def test_segments_are_scaled_by_name(factor: float) -> None:
+    body, scaled = human(), human(lengths={"thigh": factor}, radii={"foot": factor})
+    for before, after in zip(body.links, scaled.links, strict=True):
+        assert after.length == pytest.approx(before.length * (factor if before.name.endswith("thigh") else 1.0))
+        assert after.radius == pytest.approx(before.radius * (factor if before.name.endswith("foot") else 1.0))
+        assert after.mass == before.mass
+
+
+def test_a_ball_is_the_only_body_without_a_direction() -> None:
+    assert ball().is_ball and not capsule().is_ball and not chain(links=1).is_ball and not human().is_ball

@@ -1,0 +1,275 @@
+"""LARP: symmetries, the integrator, what contact may and may not change, and gradients; all with random weights."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import Array
+
+from larp_model import features, losses, rotation
+from larp_model import state as packed
+from larp_model.bodies import BALL_SURFACE, capsule, chain
+from larp_model.losses import LossWeights
+from larp_model.networks import Config
+from larp_model.scene import Pair, Scene
+from larp_model.simulator import Simulator, Weights, changes, initial_weights, integrate, measure, rollout
+from larp_model.training import first_contacts
+from larp_model.truth.episodes import Episodes
+
+STEPS = 10
+
+
+@pytest.fixture(autouse=True)
+def double_precision() -> Iterator[None]:
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="module")
+def compact_simulator(scene: Scene, compact: Config, compact_weights: Weights) -> Simulator:
+    return Simulator(scene, compact, compact_weights)
+
+
+@pytest.fixture(scope="module")
+def paper_simulator(scene: Scene, paper: Config, paper_weights: Weights) -> Simulator:
+    return Simulator(scene, paper, paper_weights)
+
+
+@pytest.fixture(params=["compact", "paper"])
+def simulator(request: pytest.FixtureRequest) -> Simulator:
+    return request.getfixturevalue(f"{request.param}_simulator")
+
+
+@pytest.fixture(scope="module")
+def kicks(scene: Scene, episodes: Episodes) -> tuple[np.ndarray, np.ndarray]:
+    """Eight states (8, L, 13) two steps before a foot meets the ball, and controls (8, STEPS, J, 3)."""
+    contacts = first_contacts(scene, episodes.states)
+    rows = np.flatnonzero((contacts >= 2) & (contacts + STEPS < episodes.steps))[:8]
+    columns = contacts[rows, None] - 2 + np.arange(STEPS)
+    states = episodes.states[rows, columns[:, 0]].astype(float)
+    states[..., packed.ORIENTATION] /= np.linalg.norm(states[..., packed.ORIENTATION], axis=-1, keepdims=True)
+    return states, episodes.controls[rows[:, None], columns].astype(float)
+
+
+ROLL = jax.jit(rollout, static_argnums=(0, 1))
+
+
+def roll(simulator: Simulator, states: np.ndarray, controls: np.ndarray) -> np.ndarray:
+    """Predicted states; compiled once for each simulator and shape."""
+    return np.asarray(ROLL(simulator.scene, simulator.config, simulator.weights, states, controls))
+
+
+def apart(first: np.ndarray, second: np.ndarray) -> float:
+    """Largest difference of states, quaternions taken up to their sign."""
+    signs = np.sign(np.sum(first[..., packed.ORIENTATION] * second[..., packed.ORIENTATION], axis=-1, keepdims=True))
+    second = second.copy()
+    second[..., packed.ORIENTATION] *= signs
+    return float(np.abs(first - second).max())
+
+
+def test_the_ball_is_kicked(compact_simulator: Simulator, kicks: tuple[np.ndarray, np.ndarray]) -> None:
+    after = roll(compact_simulator, *kicks)
+    changed = np.abs(after[:, -1, -1, 7:9] - kicks[0][:, -1, 7:9]).max(axis=-1)
+    assert np.median(changed) > 1.0, "without contact the tests below would show little"
+
+
+def test_turning_the_world_turns_the_prediction(
+    compact_simulator: Simulator, kicks: tuple[np.ndarray, np.ndarray]
+) -> None:
+    states, controls = kicks
+    angle = np.linspace(-3.0, 3.0, len(states))
+    turn = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+    turned = np.asarray(features.turn_states(jnp.asarray(states), turn))
+    expected = features.turn_states(jnp.asarray(roll(compact_simulator, states, controls)), turn[:, None])
+    assert apart(roll(compact_simulator, turned, controls), np.asarray(expected)) < 1e-7
+
+
+def test_shifting_the_world_shifts_the_prediction(simulator: Simulator, kicks: tuple[np.ndarray, np.ndarray]) -> None:
+    states, controls = kicks
+    shift = np.zeros(packed.SIZE)
+    shift[:2] = 3.0, -7.0
+    assert apart(roll(simulator, states + shift, controls), roll(simulator, states, controls) + shift) < 1e-7
+
+
+def test_a_batch_equals_single_runs(simulator: Simulator, kicks: tuple[np.ndarray, np.ndarray]) -> None:
+    states, controls = kicks
+    together = roll(simulator, states, controls)
+    alone = np.concatenate([roll(simulator, states[[i]], controls[[i]]) for i in range(len(states))])
+    np.testing.assert_allclose(alone, together, atol=1e-9)
+
+
+def test_steps_make_the_rollout(compact_simulator: Simulator, kicks: tuple[np.ndarray, np.ndarray]) -> None:
+    states, controls = kicks
+    step = jax.jit(compact_simulator.step)
+    state, after = jnp.asarray(states), []
+    for index in range(3):
+        state = step(state, jnp.asarray(controls[:, index]))
+        after.append(np.asarray(state))
+    np.testing.assert_allclose(np.stack(after, axis=1), roll(compact_simulator, states, controls)[:, :3], atol=1e-9)
+
+
+def test_orientations_stay_of_unit_length(simulator: Simulator, kicks: tuple[np.ndarray, np.ndarray]) -> None:
+    after = roll(simulator, *kicks)
+    np.testing.assert_allclose(np.linalg.norm(after[..., packed.ORIENTATION], axis=-1), 1.0, atol=1e-12)
+
+
+def test_a_ball_far_from_everything_flies_exactly(
+    compact_simulator: Simulator, kicks: tuple[np.ndarray, np.ndarray]
+) -> None:
+    states, controls = kicks[0].copy(), kicks[1]
+    states[:, -1, packed.POSITION] = 0.0, 0.0, 30.0
+    states[:, -1, packed.VELOCITY] = np.random.default_rng(0).normal(0.0, 8.0, (len(states), 3))
+    ball = roll(compact_simulator, states, controls)[:, :, -1]
+    time = 0.01 * np.arange(1, STEPS + 1)[:, None]
+    gravity, start = np.array([0.0, 0.0, -9.81]), states[:, None, -1]
+    velocity = start[..., packed.VELOCITY] + gravity * time
+    path = start[..., packed.POSITION] + start[..., packed.VELOCITY] * time + 0.5 * gravity * time**2
+    np.testing.assert_allclose(ball[..., packed.POSITION], path, atol=1e-12)
+    np.testing.assert_allclose(ball[..., packed.VELOCITY], velocity, atol=1e-12)
+    spin = np.broadcast_to(start[..., packed.ANGULAR_VELOCITY], velocity.shape)
+    np.testing.assert_allclose(ball[..., packed.ANGULAR_VELOCITY], spin, atol=1e-12)
+
+
+def test_a_body_that_touches_nothing_changes_no_other(
+    compact_simulator: Simulator, kicks: tuple[np.ndarray, np.ndarray]
+) -> None:
+    states, controls = kicks[0].copy(), kicks[1]
+    people = []
+    for place in ((5.0, 5.0, 0.11), (-4.0, 9.0, 3.0)):
+        states[:, -1, packed.POSITION] = place
+        states[:, -1, packed.VELOCITY] = place
+        people.append(roll(compact_simulator, states, controls)[:, :, :-1])
+    np.testing.assert_allclose(*people, atol=1e-12)
+
+
+@pytest.mark.parametrize("choice", ["compact", "paper"])
+def test_integrating_the_changes_gives_the_next_state(
+    choice: str, request: pytest.FixtureRequest, episodes: Episodes
+) -> None:
+    config = request.getfixturevalue(choice)
+    before, after = (jnp.asarray(episodes.states[:, step, :-1], jnp.float64) for step in (10, 11))
+    found = integrate(config, before, changes(config, before, after, 0.01), 0.01)
+    columns = slice(7, 13) if config.predict == "velocity" else slice(0, 13)
+    unit = after[..., packed.ORIENTATION] / jnp.linalg.norm(after[..., packed.ORIENTATION], axis=-1, keepdims=True)
+    after = after.at[..., packed.ORIENTATION].set(unit)
+    assert apart(np.asarray(found), np.asarray(after)) < 1e-5 or config.predict == "velocity"
+    np.testing.assert_allclose(np.abs(found[..., columns]), np.abs(after[..., columns]), atol=1e-5)
+
+
+def miss(simulator: Simulator, stop_gradient: bool, states: Array, controls: Array) -> Array:
+    """How far the balls go past a target, squared and summed over kicks."""
+    after = rollout(
+        simulator.scene, simulator.config, simulator.weights, states, controls, stop_gradient=stop_gradient
+    )
+    return jnp.sum((after[:, -1, -1, :3] + 0.3 * after[:, -1, -1, 7:10] - jnp.array([3.0, 0.5, 0.4])) ** 2)
+
+
+def test_gradient_through_ten_steps_with_contact_equals_finite_differences(
+    compact_simulator: Simulator, kicks: tuple[np.ndarray, np.ndarray]
+) -> None:
+    cost = jax.jit(partial(miss, compact_simulator, False))
+    slopes = jax.jit(jax.grad(partial(miss, compact_simulator, False), argnums=(0, 1)))(*kicks)
+    for argument, slope in enumerate(slopes):
+        for seed in range(3):
+            direction = np.random.default_rng(seed).standard_normal(slope.shape)
+            costs = []
+            for step in (1e-6, -1e-6):
+                moved = list(kicks)
+                moved[argument] = kicks[argument] + step * direction
+                costs.append(float(cost(*moved)))
+            along = float(np.vdot(slope, direction))
+            assert (costs[0] - costs[1]) / 2e-6 == pytest.approx(along, rel=1e-4)
+            assert abs(along) > 1e-4, "the ball moves with the foot, and the foot with its target"
+
+
+def test_stopping_gradients_changes_nothing_but_gradients(
+    compact_simulator: Simulator, kicks: tuple[np.ndarray, np.ndarray]
+) -> None:
+    cost, slope = jax.jit(jax.value_and_grad(partial(miss, compact_simulator, True)))(*kicks)
+    assert float(cost) == pytest.approx(float(miss(compact_simulator, False, *map(jnp.asarray, kicks))))
+    assert np.abs(slope[:, -1]).max() > 1e-3
+    np.testing.assert_array_equal(slope[:, :-1], 0.0)  # the ball does not move with the foot
+
+
+def test_gradients_through_contact_are_finite_in_single_precision(
+    simulator: Simulator, kicks: tuple[np.ndarray, np.ndarray]
+) -> None:
+    with jax.enable_x64(False):
+        states, controls = (jnp.asarray(part, jnp.float32) for part in kicks)
+        states = states.at[0, -1, :3].set(states[0, 7, :3])  # the ball inside a foot
+        shape = features.morphology(simulator.scene)[None]
+
+        def moved(states: Array, controls: Array, shape: Array) -> Array:
+            return simulator.rollout(states, controls, shape=shape)[..., :3].sum()
+
+        found = jax.jit(jax.grad(moved, argnums=(0, 1, 2)))(states, controls, shape)
+    assert all(np.isfinite(part).all() for part in found)
+
+
+def test_bodies_without_motors_that_strike_each_other_are_simulated(compact: Config) -> None:
+    pair = Pair("chain", "capsule", ("link1",), ("capsule",), BALL_SURFACE)
+    scene = Scene((chain(links=2), capsule()), (pair,))
+    state = np.zeros((2, 3, packed.SIZE))
+    state[..., 3], state[..., 2] = 1.0, 1.0
+    state[:, 2, :3] = [(0.0, 0.15, 1.0), (0.0, 3.0, 1.0)]
+    state[:, 2, 8] = -8.0
+    nothing = jnp.zeros((2, 0, 3)), jnp.zeros((2, 3, 3))
+    statistics = jax.jit(partial(measure, scene, compact))(state, state, *nothing)
+    simulator = Simulator(scene, compact, initial_weights(scene, compact, jax.random.key(0), statistics))
+    struck, missed = roll(simulator, state, np.zeros((2, 2, 0, 3)))[:, 0, :, packed.VELOCITY]
+    assert (np.abs(struck - missed)[1:].max(axis=-1) > 1e-3).all()
+
+
+@pytest.mark.parametrize(
+    ("state", "controls", "message"),
+    [
+        ((14, 13), (2, 5, 12, 3), r"state has shape \(14, 13\)"),
+        ((2, 13, 13), (2, 5, 12, 3), r"state has shape \(2, 13, 13\), but needs \(N, 14, 13\)"),
+        ((2, 14, 13), (3, 5, 12, 3), r"controls have shape \(3, 5, 12, 3\), but need \(2, H, 12, 3\)"),
+        ((2, 14, 13), (2, 12, 3), "controls have shape"),
+        ((2, 14, 13), (2, 5, 11, 3), "controls have shape"),
+    ],
+)
+def test_shapes_that_do_not_fit_are_refused(
+    compact_simulator: Simulator, state: tuple[int, ...], controls: tuple[int, ...], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        compact_simulator.rollout(jnp.zeros(state), jnp.zeros(controls))
+
+
+def test_an_unknown_choice_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match=r"config\.width is 0"):
+        Config("c", 2, 0, 2, 16, 2, 16, "heading", "change", "impulse", skip=True)
+    with pytest.raises(ValueError, match=r"config\.frame is 'sideways'"):
+        Config("c", 2, 8, 2, 16, 2, 16, "sideways", "change", "impulse", skip=True)  # type: ignore[arg-type]
+
+
+def test_losses_of_the_truth_are_zero_and_grow_with_the_error(scene: Scene, episodes: Episodes) -> None:
+    true = jnp.asarray(episodes.states[:4], jnp.float64)
+    unit = true[..., packed.ORIENTATION] / jnp.linalg.norm(true[..., packed.ORIENTATION], axis=-1, keepdims=True)
+    true = true.at[..., packed.ORIENTATION].set(unit)
+    flipped = true.at[..., packed.ORIENTATION].multiply(-1.0)
+    weigh, zero = jnp.ones(len(scene.links)), LossWeights(velocity=1.0)
+    total, terms = losses.total(scene, zero, weigh, flipped, true)
+    assert float(total) < 1e-9 and all(float(value) > -1e-12 for value in terms.values())
+    shifted = true.at[..., -1, packed.POSITION].add(jnp.array([0.3, 0.0, -0.4]))
+    np.testing.assert_allclose(losses.position(shifted, true)[..., -1], 0.25)
+    turned = true.at[..., packed.ORIENTATION].set(rotation.integrate(unit, jnp.array([0.2, 0.0, 0.0])))
+    np.testing.assert_allclose(losses.rotation(turned, true), 1.0 - np.cos(0.1), atol=1e-12)
+    stretched = true.at[..., 0, packed.POSITION].add(jnp.array([0.0, 0.0, 0.1]))
+    joints = np.asarray(losses.displacement(scene, stretched, features.morphology(scene))).reshape(-1, 12).mean(axis=0)
+    on_pelvis = [parent == 0 for _, parent, _ in scene.joints()]
+    np.testing.assert_allclose(joints, np.where(on_pelvis, 0.01, 0.0), atol=1e-6)
+
+
+def test_emphasis_weighs_the_links_it_names(scene: Scene, episodes: Episodes) -> None:
+    true = jnp.asarray(episodes.states[:4])
+    shifted = true.at[..., -1, 0].add(1.0)
+    even, ball = jnp.ones(len(scene.links)), jnp.ones(len(scene.links)).at[-1].set(3.0)
+    terms = [losses.total(scene, LossWeights(), weigh, shifted, true)[1]["position"] for weigh in (even, ball)]
+    assert float(terms[1]) == pytest.approx(3.0 * float(terms[0]), rel=1e-5)
