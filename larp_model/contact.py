@@ -134,7 +134,8 @@ def impact(depth: Array, approach: Array, acceleration: Array | float, surface: 
     amplitude = jnp.sqrt(offset**2 + rate**2)
     phase = jnp.arctan2(offset, rate)
     balance = jnp.clip(equilibrium / amplitude, -0.999, 0.999)
-    until = (jnp.pi + jnp.arcsin(balance) - phase) / frequency
+    # A motion smaller than the equilibrium never returns to zero.
+    until = jnp.where(equilibrium >= amplitude, time, (jnp.pi + jnp.arcsin(balance) - phase) / frequency)
     touching = jnp.clip(until, 0.0, time)
     angle, envelope = frequency * touching, jnp.exp(-decay * touching)
     cosine, sine = envelope * jnp.cos(angle), envelope * jnp.sin(angle)

@@ -43,7 +43,7 @@ class Recipe:
     curriculum: (unroll in steps, share of the updates) in order. learning_rate falls to `final` of itself by a cosine.
     clip: largest gradient norm. drop: norm beyond which a batch is dropped. contact_share: windows that start from
     `before_contact` steps before to `after_contact` steps after the first contact. emphasis: weight of each body's
-    links in the loss.
+    links in the loss. only: beginnings of the names of the networks to train; the others stay as they are. None: all.
     """
 
     updates: int = 20000
@@ -59,6 +59,7 @@ class Recipe:
     emphasis: tuple[tuple[str, float], ...] = (("ball", 3.0),)
     loss: LossWeights = field(default_factory=LossWeights)
     stop_gradient: bool = True
+    only: tuple[str, ...] = ()
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -177,21 +178,23 @@ def train(
     windows = Windows(scene, sources, recipe)
     weights = statistics_of(scene, config, windows, random) if start is None else start
     transform = optimiser(recipe)
-    progressed = Progressed(weights.networks, transform.init(weights.networks), 0)
+    fixed = {name: value for name, value in weights.networks.items() if not name.startswith(recipe.only or "")}
+    trained = {name: value for name, value in weights.networks.items() if name not in fixed}
+    progressed = Progressed(trained, transform.init(trained), 0)
     manager = ocp.CheckpointManager(
         (folder / "checkpoints").absolute(), options=ocp.CheckpointManagerOptions(max_to_keep=1, create=True)
     )
     if manager.latest_step() is not None:
         restored = manager.restore(manager.latest_step(), args=ocp.args.StandardRestore((progressed, weights[1:])))
         progressed, statistics = Progressed(*restored[0]), restored[1]
-        weights = Weights(progressed.networks, *statistics)
+        weights = Weights(fixed | progressed.networks, *statistics)
     weigh = emphasis(scene, recipe)
 
     def loss_of(
         networks: dict[str, Any], states: Array, controls: Array, torques: Array
     ) -> tuple[Array, dict[str, Array]]:
         predicted = rollout(
-            scene, config, weights._replace(networks=networks), states[:, 0], controls, torques,
+            scene, config, weights._replace(networks=fixed | networks), states[:, 0], controls, torques,
             stop_gradient=recipe.stop_gradient,
         )  # fmt: skip
         return losses.total(scene, recipe.loss, weigh, predicted, states[:, 1:])
@@ -257,4 +260,4 @@ def train(
     manager.wait_until_finished()
     manager.close()
     log["seconds"] = time.perf_counter() - begin
-    return weights._replace(networks=networks), log
+    return weights._replace(networks=fixed | networks), log

@@ -1,7 +1,7 @@
 """The planner: optimises joint targets through any `Dynamics`; knows states, controls and costs only."""
 
 from mpc.cem import CEM
-from mpc.cost import CostTerm, absolute, evaluate, l2, quadratic
+from mpc.cost import CostTerm, absolute, evaluate, l2, nearest_on_path, quadratic
 from mpc.dynamics import Continued, Dynamics, MujocoDynamics
 from mpc.gradient import Gradient
 from mpc.planner import Plan, PlanInfo, Planner
@@ -21,6 +21,7 @@ __all__ = [
     "evaluate",
     "interpolate",
     "l2",
+    "nearest_on_path",
     "quadratic",
     "shift",
 ]

@@ -62,9 +62,7 @@ class CEM:
     def improve(self, search: Search, key: jax.Array, score: Score) -> tuple[Search, list[jax.Array]]:
         """All rounds; also returns every candidate's cost, (N,) a round."""
 
-        def one_round(
-            size: int, search: Search, inputs: tuple[jax.Array, jax.Array]
-        ) -> tuple[Search, jax.Array]:
+        def one_round(size: int, search: Search, inputs: tuple[jax.Array, jax.Array]) -> tuple[Search, jax.Array]:
             key, last = inputs
             candidates = self.sample(search, key, size, last)
             costs = score(candidates)

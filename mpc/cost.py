@@ -69,6 +69,19 @@ def evaluate(
     return jnp.where(finite, total, jnp.inf), shares
 
 
+def nearest_on_path(path: jax.Array, point: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Where a path (T, 3) [m], straight between its rows, comes nearest to `point` (3,) [m], and the row before that.
+
+    A ball flies some 10 cm between two states, so that the distance at the states alone overstates the miss.
+    """
+    start, along = path[:-1], path[1:] - path[:-1]
+    squared = jnp.sum(along**2, axis=-1)
+    share = jnp.sum((point - start) * along, axis=-1) / jnp.where(squared > 0.0, squared, 1.0)
+    places = start + jnp.clip(share, 0.0, 1.0)[:, None] * along
+    row = jnp.argmin(jnp.sum((places - point) ** 2, axis=-1))
+    return places[row], row
+
+
 def require_weight(name: str, weight: float) -> None:
     """Refuses a weight that is negative or not finite."""
     if not (np.isfinite(weight) and weight >= 0):

@@ -84,9 +84,7 @@ class Gradient:
 Carry = tuple[jax.Array, optax.OptState, jax.Array, jax.Array]
 
 
-def _cheaper(
-    knots: jax.Array, costs: jax.Array, best: jax.Array, best_costs: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def _cheaper(knots: jax.Array, costs: jax.Array, best: jax.Array, best_costs: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Per candidate the cheaper of two, the best so far in a tie."""
     won = costs < best_costs
     return jnp.where(won[:, None, None, None], knots, best), jnp.where(won, costs, best_costs)

@@ -8,9 +8,7 @@ import jax.numpy as jnp
 Interpolation = Literal["linear", "cubic"]
 
 
-def interpolate(
-    knots: jax.Array, knot_times: jax.Array, times: jax.Array, kind: Interpolation = "cubic"
-) -> jax.Array:
+def interpolate(knots: jax.Array, knot_times: jax.Array, times: jax.Array, kind: Interpolation = "cubic") -> jax.Array:
     """Values (H, *D) at `times` (H,) of the spline through `knots` (K, *D) at rising `knot_times` (K,) [s].
 
     Linear in the knots, and through every one of them. "cubic" is the Hermite spline whose slope at a knot is

@@ -36,7 +36,7 @@ from larp_model.bodies import human_and_ball, standing_height
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from larp_model.truth.mujoco import Truth
-from mpc import CEM, Continued, CostTerm, Dynamics, Gradient, MujocoDynamics, Planner, l2, quadratic
+from mpc import CEM, Continued, CostTerm, Dynamics, Gradient, MujocoDynamics, Planner, l2, nearest_on_path, quadratic
 from mpc.loop import Execution, Window, execute
 from tasks import references
 from tasks.data import stray
@@ -46,6 +46,8 @@ from viewer.recording import write_whole
 
 HORIZON = 60
 FLIGHT = 110
+# Spread of a first plan, as a share of how far the training data strays from the reference.
+SEARCH = 0.5
 KNOTS = 9
 AFTER_CONTACT = 200
 REACHABLE = 0.25
@@ -85,15 +87,6 @@ PRESETS = {
 }
 
 
-def ball_distance(path: Array, target: Array) -> Array:
-    """Vector (3,) from the target to the nearest point of the ball's path (T, 3), straight between steps."""
-    start, along = path[:-1], path[1:] - path[:-1]
-    share = jnp.sum((target - start) * along, axis=-1) / (jnp.sum(along**2, axis=-1) + 1e-9)
-    nearest = start + jnp.clip(share, 0.0, 1.0)[:, None] * along
-    squared = jnp.sum((nearest - target) ** 2, axis=-1)
-    return nearest[jnp.argmin(squared)] - target
-
-
 class Kick:
     """The kick task on one scene and reference: terms, windows, planners, execution and its report."""
 
@@ -112,7 +105,8 @@ class Kick:
         """The named costs of a candidate."""
 
         def target(states: Array, controls: Array, context: Any) -> Array:
-            return ball_distance(states[:, self.ball, packed.POSITION], context["target"])
+            nearest, _ = nearest_on_path(states[:, self.ball, packed.POSITION], context["target"])
+            return nearest - context["target"]
 
         def near_reference(states: Array, controls: Array, context: Any) -> Array:
             links = states[: len(controls), self.human, packed.POSITION]
@@ -134,8 +128,8 @@ class Kick:
 
         return (
             CostTerm("target", target, l2(0.05), 10.0),
-            CostTerm("reference", near_reference, quadratic, 1.0),
-            CostTerm("effort", effort, quadratic, 0.1),
+            CostTerm("reference", near_reference, quadratic, 20.0),
+            CostTerm("effort", effort, quadratic, 0.5),
             CostTerm("upright", upright, quadratic, 20.0),
             CostTerm("find_ball", find_ball, quadratic, 5.0),
         )
@@ -160,7 +154,15 @@ class Kick:
         """A planner of this task; gradient steps are left out where the dynamics have no gradient."""
         usable = [each for each in optimizers if dynamics.differentiable or isinstance(each, CEM)]
         return Planner(
-            dynamics, self.terms, HORIZON, KNOTS, self.scene.dt, stray(self.scene), usable, self.lower, self.upper
+            dynamics,
+            self.terms,
+            HORIZON,
+            KNOTS,
+            self.scene.dt,
+            SEARCH * stray(self.scene),
+            usable,
+            self.lower,
+            self.upper,
         )
 
     def start(self, ball_offset: np.ndarray | tuple[float, float] = (0.0, 0.0)) -> np.ndarray:

@@ -43,7 +43,9 @@ class Stage(NamedTuple):
     recipe: training.Recipe
 
 
-# Single steps around contacts teach the impact at a twentieth of a rollout's price; rollouts then teach to stay true.
+# Single steps around contacts teach impacts, at a twentieth of a rollout's price; rollouts teach the human to stay
+# true. Rollouts would blur the impacts: a late foot makes any launch look wrong.
+HUMAN, IMPACTS = ("dynamics/human",), ("dynamics/ball", "contact")
 STAGES = (
     Stage(
         "steps",
@@ -51,10 +53,18 @@ STAGES = (
         training.Recipe(6000, 512, ((1, 1.0),), learning_rate=1e-3, before_contact=2, after_contact=3, loss=LOSS),
     ),
     Stage(
-        "rollouts", False, training.Recipe(3600, 256, ((4, 0.15), (8, 0.25), (20, 0.6)), learning_rate=5e-4, loss=LOSS)
+        "rollouts",
+        False,
+        training.Recipe(6000, 256, ((4, 0.1), (8, 0.2), (20, 0.7)), learning_rate=5e-4, loss=LOSS, only=HUMAN),
     ),
-    Stage("planned1", True, training.Recipe(1500, 256, ((20, 1.0),), learning_rate=2e-4, loss=LOSS)),
-    Stage("planned2", True, training.Recipe(1500, 256, ((20, 1.0),), learning_rate=2e-4, loss=LOSS)),
+    Stage("planned1", True, training.Recipe(2000, 256, ((20, 1.0),), learning_rate=2e-4, loss=LOSS, only=HUMAN)),
+    Stage(
+        "impacts",
+        False,
+        training.Recipe(
+            15000, 512, ((1, 1.0),), contact_share=0.9, before_contact=1, after_contact=2, loss=LOSS, only=IMPACTS
+        ),
+    ),
 )
 
 

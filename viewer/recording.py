@@ -9,10 +9,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from larp_model.scene import Scene
 from larp_model.state import POSITION, SIZE
+from mpc.cost import nearest_on_path
 
 
 class Approach(NamedTuple):
@@ -24,20 +26,12 @@ class Approach(NamedTuple):
 
 
 def nearest_approach(path: np.ndarray, target: np.ndarray) -> Approach:
-    """Where the straight lines between the points (T, 3) [m] of a path pass nearest to `target` (3,) [m].
-
-    A ball flies some 10 cm between two states, so that the distance at the states alone overstates the miss.
-    """
+    """Where a path (T, 3) [m] passes nearest to `target` (3,) [m]; see `mpc.nearest_on_path`."""
     path, target = np.asarray(path, float), np.asarray(target, float)
     if path.ndim != 2 or path.shape[1] != 3 or not len(path):
         raise ValueError(f"path has shape {path.shape}, but needs (T, 3) with at least one point")
-    start, step = path, np.diff(path, axis=0, append=path[-1:])
-    squared = np.sum(step**2, axis=1)
-    fraction = np.sum((target - start) * step, axis=1) / np.where(squared > 0.0, squared, 1.0)
-    points = start + np.clip(fraction, 0.0, 1.0)[:, None] * step
-    distance = np.linalg.norm(points - target, axis=1)
-    row = int(np.argmin(distance))
-    return Approach(float(distance[row]), points[row], row)
+    point, row = nearest_on_path(jnp.asarray(np.append(path, path[-1:], axis=0)), jnp.asarray(target))
+    return Approach(float(np.linalg.norm(np.asarray(point) - target)), np.asarray(point), int(row))
 
 
 @dataclass(frozen=True, eq=False)

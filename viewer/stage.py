@@ -43,9 +43,7 @@ class Stage:
                 "/target", radius, TARGET, opacity=0.45, cast_shadow=False, position=self._target
             )
             top = self._target + np.array([0.0, 0.0, radius])
-            self._label = server.scene.add_label(
-                "/nearest", "", position=top, anchor="bottom-center", visible=False
-            )
+            self._label = server.scene.add_label("/nearest", "", position=top, anchor="bottom-center", visible=False)
             self._truth = SceneView(server, scene, "/truth")
             self._ghost = SceneView(server, scene, "/prediction", PREDICTION, opacity=0.4)
             self._ghost.update(None)
