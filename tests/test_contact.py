@@ -256,7 +256,7 @@ def test_a_foot_that_crosses_the_ball_within_a_step_is_seen(scene: Scene) -> Non
 
 
 def integrated(
-    depth: float, approach: float, acceleration: float, surface: Surface, time: float
+    acceleration: float, surface: Surface, depth: float, approach: float, time: float
 ) -> tuple[float, float]:
     """Gap [m] and its speed [m/s] after `time` by numerical integration of the equation in `contact.impact`."""
     share = contact.IMPEDANCE
@@ -284,9 +284,9 @@ def test_impact_solves_its_equation_through_release(surface: Surface, accelerati
     depth = np.where(random.random(40) < 0.5, 0.0, random.uniform(0.0, 0.02, 40))
     approach, time = random.uniform(0.5, 15.0, 40), random.uniform(0.0, 0.01, 40)
     approach[depth > 0.0] -= 8.0  # some are already on their way out
-    arguments = (depth, approach, acceleration, surface, time)
     found = impact(jnp.asarray(depth), jnp.asarray(approach), acceleration, surface, jnp.asarray(time))
-    gap, speed = np.array([integrated(*(np.broadcast_to(a, 40)[i] for a in arguments)) for i in range(40)]).T
+    rows = zip(depth, approach, time, strict=True)
+    gap, speed = np.array([integrated(acceleration, surface, *row) for row in rows]).T
     np.testing.assert_allclose(found.gap, gap, atol=2e-6)
     change = speed + approach + acceleration * time
     np.testing.assert_allclose(found.change, np.maximum(change, 0.0), atol=2e-3)  # a contact never pulls
@@ -354,7 +354,7 @@ def test_forward_reverse_and_finite_differences_of_an_impact_agree() -> None:
     depth, approach = jnp.array([0.0, 0.004, 0.001, 0.02]), jnp.array([8.0, -1.0, 12.0, 0.3])
     time = jnp.array([0.005, 0.003, 0.01, 0.01])
 
-    def found(*arguments: Array) -> contact.Impact:
-        return contact.impact(*arguments[:3], BALL_SURFACE, arguments[3])
+    def found(depth: Array, approach: Array, acceleration: Array, time: Array) -> contact.Impact:
+        return contact.impact(depth, approach, acceleration, BALL_SURFACE, time)
 
     check_grads(jax.jit(found), (depth + 1e-5, approach, jnp.full(4, 9.81), time), 1, ("fwd", "rev"), 1e-4, 1e-4, 1e-7)

@@ -77,8 +77,8 @@ def test_both_signs_of_a_quaternion_are_one_rotation() -> None:
 
 def test_two_half_turns_are_one_whole() -> None:
     q, vector = quaternions(6), np.random.default_rng(6).standard_normal((200, 3))
-    half = rotation.integrate(rotation.integrate(jnp.asarray(q), 0.5 * vector), 0.5 * vector)
-    np.testing.assert_allclose(rotation.integrate(jnp.asarray(q), vector), half, atol=1e-14)
+    half = rotation.integrate(rotation.integrate(jnp.asarray(q), jnp.asarray(0.5 * vector)), jnp.asarray(0.5 * vector))
+    np.testing.assert_allclose(rotation.integrate(jnp.asarray(q), jnp.asarray(vector)), half, atol=1e-14)
     turn = Rotation.from_rotvec(vector) * Rotation.from_quat(q, scalar_first=True)
     np.testing.assert_allclose(rotation.matrix(half), turn.as_matrix(), atol=1e-14)
 
@@ -110,16 +110,16 @@ def test_turns_about_z_are_those_of_the_quaternion() -> None:
     np.testing.assert_allclose(rotation.about_z(found, rotation.opposite(turn)), vectors, atol=1e-14)
 
 
-FUNCTIONS: list[tuple[Callable[..., Array], tuple[np.ndarray, ...]]] = [
-    (rotation.from_rotation_vector, (np.array([0.3, -0.7, 0.2]),)),
-    (rotation.to_rotation_vector, (quaternions(8)[20],)),
-    (rotation.integrate, (quaternions(8)[21], np.array([0.1, 0.4, -0.3]))),
-    (rotation.heading, (quaternions(8)[22],)),
-    (rotation.matrix, (quaternions(8)[23],)),
-]
-
-
-@pytest.mark.parametrize(("function", "arguments"), FUNCTIONS, ids=["exponential", "logarithm", "integrate", "heading", "matrix"])
+@pytest.mark.parametrize(
+    ("function", "arguments"),
+    [
+        pytest.param(rotation.from_rotation_vector, (np.array([0.3, -0.7, 0.2]),), id="exponential"),
+        pytest.param(rotation.to_rotation_vector, (quaternions(8)[20],), id="logarithm"),
+        pytest.param(rotation.integrate, (quaternions(8)[21], np.array([0.1, 0.4, -0.3])), id="integrate"),
+        pytest.param(rotation.heading, (quaternions(8)[22],), id="heading"),
+        pytest.param(rotation.matrix, (quaternions(8)[23],), id="matrix"),
+    ],
+)
 def test_forward_reverse_and_finite_differences_agree(
     function: Callable[..., Array], arguments: tuple[np.ndarray, ...]
 ) -> None:

@@ -62,7 +62,7 @@ def test_a_description_refuses_nonsense_by_field(description: Link, field: str, 
     [
         (lambda: Body("b", "b", ()), "'b' has no links"),
         (lambda: Body("b", "b", (LINK,), (JOINT,)), "'b' has 1 joints"),
-        (lambda: Body("b", "b", (LINK, dataclasses.replace(LINK, name="x")), (Joint(1, *[(0.0, 0.0, 0.0)] * 2),)),
+        (lambda: Body("b", "b", (LINK, dataclasses.replace(LINK, name="x")), (dataclasses.replace(JOINT, parent=1),)),
          "parent of link 1 is 1"),
         (lambda: Body("b", "b", (LINK, LINK), (JOINT,)), "link names"),
         (lambda: Scene(()), "scene.bodies"),

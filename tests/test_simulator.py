@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -141,12 +142,12 @@ def test_a_body_that_touches_nothing_changes_no_other(
     compact_simulator: Simulator, kicks: tuple[np.ndarray, np.ndarray]
 ) -> None:
     states, controls = kicks[0].copy(), kicks[1]
-    people = []
+    people: list[np.ndarray] = []
     for place in ((5.0, 5.0, 0.11), (-4.0, 9.0, 3.0)):
         states[:, -1, packed.POSITION] = place
         states[:, -1, packed.VELOCITY] = place
         people.append(roll(compact_simulator, states, controls)[:, :, :-1])
-    np.testing.assert_allclose(*people, atol=1e-12)
+    np.testing.assert_allclose(people[0], people[1], atol=1e-12)
 
 
 @pytest.mark.parametrize("choice", ["compact", "paper"])
@@ -163,7 +164,7 @@ def test_integrating_the_changes_gives_the_next_state(
     np.testing.assert_allclose(np.abs(found[..., columns]), np.abs(after[..., columns]), atol=1e-5)
 
 
-def wide(after: Array) -> Array:
+def wide(after: Any) -> Any:
     """How far the balls go past a target, squared and summed over kicks."""
     return ((after[:, -1, -1, :3] + 0.3 * after[:, -1, -1, 7:10] - np.array([3.0, 0.5, 0.4])) ** 2).sum()
 

@@ -38,7 +38,7 @@ def swings() -> Episodes:
 
 def same(first: Weights, second: Weights) -> bool:
     """Whether two sets of weights are equal bit for bit."""
-    return all(np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (first, second)), strict=True))
+    return all(jax.tree.leaves(jax.tree.map(np.array_equal, first, second)))
 
 
 def test_a_window_is_an_unbroken_piece_of_one_episode() -> None:

@@ -25,10 +25,8 @@ def stored(tmp_path: Path, scene: Scene, compact: Config, compact_weights: Weigh
 
 
 def equal(first: Weights, second: Weights) -> bool:
-    """Whether two sets of weights have the same structure and values."""
-    if jax.tree.structure(first) != jax.tree.structure(second):
-        return False
-    return all(np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (first, second)), strict=True))
+    """Whether two sets of weights are equal bit for bit."""
+    return all(jax.tree.leaves(jax.tree.map(np.array_equal, first, second)))
 
 
 @pytest.mark.parametrize("kind", ["compact", "paper"])
@@ -74,7 +72,9 @@ def refusal(stored: Path, scene: Scene) -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize("other", [human_and_ball(height=1.8), human_and_ball(dt=0.005), human_and_ball().only("human")])
+@pytest.mark.parametrize(
+    "other", [human_and_ball(height=1.8), human_and_ball(dt=0.005), human_and_ball().only("human")]
+)
 def test_weights_of_another_scene_are_refused(stored: Path, other: Scene) -> None:
     assert "were made for scene" in refusal(stored, other)
 
