@@ -40,6 +40,9 @@ _MOTOR = {
     "foot": (400.0, 8.0, 200.0, (-0.5, -0.6, -0.5), (0.5, 1.0, 0.5)),
 }
 
+# Inertia of the motors [kg m^2]: light feet on stiff servos would ask for three times as many engine steps.
+ARMATURE = 0.01
+
 KICKING_LINKS = ("left_thigh", "left_shin", "left_foot", "right_thigh", "right_shin", "right_foot")
 
 
@@ -107,7 +110,7 @@ def human(
 
     def joint(child: str, parent: int, parent_anchor: Vector, child_anchor: Vector) -> Joint:
         stiffness, damping, torque, lower, upper = _MOTOR[child.removeprefix("left_").removeprefix("right_")]
-        motor = Motor(strength * stiffness, strength * damping, strength * torque, lower, upper)
+        motor = Motor(strength * stiffness, strength * damping, strength * torque, lower, upper, strength * ARMATURE)
         if child.startswith("right_"):  # mirroring y turns roll and yaw round
             motor = replace(motor, lower=(-upper[0], lower[1], -upper[2]), upper=(-lower[0], upper[1], -lower[2]))
         return Joint(parent, parent_anchor, child_anchor, motor)

@@ -57,6 +57,7 @@ class Motor:
 
     stiffness: [N m/rad]. damping: [N m s/rad]. torque_limit: per axis [N m].
     lower, upper: bounds of the joint target, a rotation vector relative to the parent [rad].
+    armature: inertia that the motor itself adds to the joint [kg m^2].
     """
 
     stiffness: float
@@ -64,8 +65,10 @@ class Motor:
     torque_limit: float
     lower: Vector
     upper: Vector
+    armature: float = 0.0
 
     def __post_init__(self) -> None:
+        _check("motor", "armature", self.armature, 0.0, strict=False)
         _check("motor", "stiffness", self.stiffness, 0.0, strict=True)
         _check("motor", "damping", self.damping, 0.0, strict=False)
         _check("motor", "torque_limit", self.torque_limit, 0.0, strict=True)

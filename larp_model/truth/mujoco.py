@@ -15,7 +15,7 @@ from larp_model import state as packed
 from larp_model.scene import Body, Link, Scene, Surface, anchor
 
 # Halving the engine's step beyond this moves the ball's launch velocity by less than 1 % (median).
-SUBSTEPS = 16
+SUBSTEPS = 20
 # Beyond these a trajectory has diverged [m, m/s, rad/s].
 LIMITS = ((packed.POSITION, 1e3), (packed.VELOCITY, 1e2), (packed.ANGULAR_VELOCITY, 1e3))
 
@@ -56,6 +56,7 @@ def _add_body(spec: mujoco.MjSpec, body: Body) -> None:
             hinge = added.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_BALL, pos=child_anchor)
             hinge.damping[0] = joint.damping if joint.motor is None else joint.motor.damping
             if joint.motor is not None:
+                hinge.armature = joint.motor.armature
                 for axis in np.eye(3):
                     servo = spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
                     servo.gear[:3] = axis
