@@ -101,11 +101,12 @@ class Windows:
         counts = random.multinomial(self.recipe.batch, self.share)
         parts = []
         for source, contacts, count in zip(self.sources, self.contacts, counts, strict=True):
-            struck = np.flatnonzero(contacts >= 0)
+            last = source.controls.shape[1] - steps
+            # A contact so late that its windows would have to start earlier than asked for is left out.
+            struck = np.flatnonzero((contacts >= 0) & (contacts - self.recipe.before_contact <= last))
             near = min(round(self.recipe.contact_share * count), count if len(struck) else 0)
             anywhere = random.integers(len(contacts), size=count - near)
             chosen = np.concatenate([struck[random.integers(len(struck), size=near)] if near else struck[:0], anywhere])
-            last = source.controls.shape[1] - steps
             if last < 0:
                 raise ValueError(f"episodes have {source.controls.shape[1]} steps, but the unroll needs {steps}")
             start = random.integers(last + 1, size=count)
