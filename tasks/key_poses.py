@@ -1,7 +1,7 @@
 """Key poses of the embedded kick: plant, backswing, strike, follow-through, recovery.
 
-Authored by hand, then refined in the truth by `tasks.refine`. Angles are components of joint rotation vectors [rad]:
-axis 0 rolls about x, 1 pitches about y, 2 yaws about z.
+Authored by hand, then refined in the truth by a cross-entropy search over these numbers. Angles are components of
+joint rotation vectors [rad]: axis 0 rolls about x, 1 pitches about y, 2 yaws about z.
 """
 
 KEY_TIMES = (0.0, 0.134, 0.267, 0.363, 0.477, 0.763, 1.145)
