@@ -69,16 +69,18 @@ def evaluate(
     return jnp.where(finite, total, jnp.inf), shares
 
 
-def nearest_on_path(path: jax.Array, point: jax.Array) -> tuple[jax.Array, jax.Array]:
+def nearest_on_path(path: Any, point: Any) -> tuple[Any, Any]:
     """Where a path (T, 3) [m], straight between its rows, comes nearest to `point` (3,) [m], and the row before that.
 
-    A ball flies some 10 cm between two states, so that the distance at the states alone overstates the miss.
+    NumPy or JAX arrays, in their own precision. A ball flies some 10 cm between two states, so that the distance at
+    the states alone overstates the miss.
     """
+    xp = path.__array_namespace__()
     start, along = path[:-1], path[1:] - path[:-1]
-    squared = jnp.sum(along**2, axis=-1)
-    share = jnp.sum((point - start) * along, axis=-1) / jnp.where(squared > 0.0, squared, 1.0)
-    places = start + jnp.clip(share, 0.0, 1.0)[:, None] * along
-    row = jnp.argmin(jnp.sum((places - point) ** 2, axis=-1))
+    squared = xp.sum(along**2, axis=-1)
+    share = xp.sum((point - start) * along, axis=-1) / xp.where(squared > 0.0, squared, 1.0)
+    places = start + xp.clip(share, 0.0, 1.0)[:, None] * along
+    row = xp.argmin(xp.sum((places - point) ** 2, axis=-1))
     return places[row], row
 
 

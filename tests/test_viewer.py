@@ -84,9 +84,9 @@ def test_nearest_approach_lies_between_states(along: float, miss: float, offset:
     path = np.arange(-3.0, 4.0)[:, None] * [1.0, 0.0, 0.0] + [offset, 0.0, 0.0]
     target = np.array([along, miss, 0.0])
     approach = nearest_approach(path, target)
-    assert approach.distance == pytest.approx(miss, abs=1e-5)
-    np.testing.assert_allclose(approach.point, [along, 0.0, 0.0], atol=1e-5)  # of 32-bit arithmetic
-    assert path[approach.row, 0] <= along + 1e-5
+    assert approach.distance == pytest.approx(miss)
+    np.testing.assert_allclose(approach.point, [along, 0.0, 0.0], atol=1e-9)
+    assert path[approach.row, 0] <= along + 1e-9
 
 
 def test_nearest_approach_of_a_resting_ball() -> None:

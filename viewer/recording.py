@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from larp_model.scene import Scene
@@ -30,8 +29,8 @@ def nearest_approach(path: np.ndarray, target: np.ndarray) -> Approach:
     path, target = np.asarray(path, float), np.asarray(target, float)
     if path.ndim != 2 or path.shape[1] != 3 or not len(path):
         raise ValueError(f"path has shape {path.shape}, but needs (T, 3) with at least one point")
-    point, row = nearest_on_path(jnp.asarray(np.append(path, path[-1:], axis=0)), jnp.asarray(target))
-    return Approach(float(np.linalg.norm(np.asarray(point) - target)), np.asarray(point), int(row))
+    point, row = nearest_on_path(np.append(path, path[-1:], axis=0), target)
+    return Approach(float(np.linalg.norm(point - target)), point, int(row))
 
 
 @dataclass(frozen=True, eq=False)
