@@ -115,10 +115,10 @@ def human(
             motor = replace(motor, lower=(-upper[0], lower[1], -upper[2]), upper=(-lower[0], upper[1], -lower[2]))
         return Joint(parent, parent_anchor, child_anchor, motor)
 
-    # Lengths and radii in metres of a human of 1.75 m.
+    # Lengths and radii in metres of a human of 1.75 m; its joints are at the heights that Winter gives, to 1 cm.
     links = [
         link("pelvis", 0.14, 0.10, (0.0, 1.0, 0.0)),
-        link("torso", 0.26, 0.12),
+        link("torso", 0.315, 0.12),
         link("head", 0.08, 0.095),
     ]
     joints = [
@@ -128,10 +128,10 @@ def human(
     for side, y in (("left", 1.0), ("right", -1.0)):
         arm, leg = len(links), len(links) + 2
         links += [
-            link(f"{side}_upper_arm", 0.26, 0.045),
+            link(f"{side}_upper_arm", 0.295, 0.045),
             link(f"{side}_lower_arm", 0.30, 0.038),
-            link(f"{side}_thigh", 0.30, 0.075),
-            link(f"{side}_shin", 0.32, 0.050),
+            link(f"{side}_thigh", 0.306, 0.075),
+            link(f"{side}_shin", 0.325, 0.050),
             link(f"{side}_foot", 0.18, 0.042, (1.0, 0.0, 0.0)),
         ]
         joints += [

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model import contact, rotation
+from larp_model import compliance, contact, rotation
 from larp_model import state as packed
 from larp_model.scene import Body, Pair, Scene
 
@@ -187,7 +187,8 @@ class Touch(NamedTuple):
     inputs: (B, P, F) for the contact network, in the first link's frame. gap: (B, P) [m] when the step begins.
     impact: along the normal. near: (B, P), 1 where the links touch within the step, falling to 0 over 3 cm.
     normal: from the first to the second. slide: tangential velocity [m/s] of the first against the second.
-    first_arm, second_arm: from the links' centres to the contact [m]. mass: reduced mass [kg] of the two links.
+    first_arm, second_arm: from the links' centres to the contact [m]. mass: (B, P) effective mass [kg] of the contact
+    along the normal, the links' parents included.
     """
 
     inputs: Array
@@ -219,44 +220,64 @@ def _segments(scene: Scene, state: Array, rows: np.ndarray, matrices: Array, sha
     return contact.Segment(packed.position(state)[..., rows, :], half, radius)
 
 
-def contact_inputs(scene: Scene, pair: Pair, state: Array, control: Array, shape: Array) -> Touch:
-    """The contacts of `pair` in states (B, L, 13) under control (B, J, 3), at the moment the links meet in the step.
+def contact_inputs(scene: Scene, pair: Pair, state: Array, free: Array, shape: Array) -> Touch:
+    """The contacts of `pair` in states (B, L, 13), at the moment the links meet in the step.
 
-    Both links move on at their velocities until they meet (conservative advancement); the gap, normal and speeds are
-    those of that moment, so that a foot that crosses the ball within a step is seen.
+    free: states (B, L, 13) after the step if nothing touched; of it, the velocities count. Both links move on,
+    evenly accelerated, until they meet (conservative advancement); the gap, normal and speeds are those of that
+    moment, so that a foot that crosses the ball within a step is seen.
     """
     first, second = pair_rows(scene, pair)
     matrices = rotation.matrix(packed.orientation(state))
     turn = matrices[..., first, :, :]
-    velocity, spin = packed.velocity(state), packed.angular_velocity(state)
     a = _segments(scene, state, first, turn, shape)
     b = _segments(scene, state, second, matrices[..., second, :, :], shape)
-    v1, v2, w1, w2 = velocity[..., first, :], velocity[..., second, :], spin[..., first, :], spin[..., second, :]
+
+    def motion(rows: np.ndarray) -> tuple[Array, Array, Array, Array]:
+        velocity, spin = packed.velocity(state)[..., rows, :], packed.angular_velocity(state)[..., rows, :]
+        gained = packed.velocity(free)[..., rows, :] - velocity
+        turned = packed.angular_velocity(free)[..., rows, :] - spin
+        return velocity, spin, gained, turned
+
+    v1, w1, dv1, dw1 = motion(first)
+    v2, w2, dv2, dw2 = motion(second)
 
     def closest_at(time: Array) -> tuple[contact.Closest, Array, Array, Array, Array]:
-        one, two = contact.moved(a, v1, w1, time), contact.moved(b, v2, w2, time)
+        share = (time / scene.dt)[..., None]
+        half = 0.5 * share
+        one = contact.moved(a, v1 + half * dv1, w1 + half * dw1, time)
+        two = contact.moved(b, v2 + half * dv2, w2 + half * dw2, time)
         found = contact.closest(one, two)
         arm1, arm2 = found.point - one.centre, found.point - two.centre
-        relative = v1 + jnp.cross(w1, arm1) - v2 - jnp.cross(w2, arm2)
+        relative = v1 + share * dv1 + jnp.cross(w1 + share * dw1, arm1)
+        relative -= v2 + share * dv2 + jnp.cross(w2 + share * dw2, arm2)
         return found, arm1, arm2, relative, jnp.sum(relative * found.normal, axis=-1)
 
     def advance(time: Array, nothing: None) -> tuple[Array, Array]:
         found, _, _, _, approach = closest_at(time)
-        return time + contact.time_of_impact(found.distance, approach, scene.dt - time), found.distance
+        ahead = contact.time_of_impact(found.distance, approach, scene.dt - time)
+        # Links that sped up met earlier than their first speeds told.
+        back = jnp.minimum(found.distance, 0.0) / jnp.where(approach > 1e-3, approach, jnp.inf)
+        return time + jnp.where(found.distance > 0.0, ahead, jnp.maximum(back, -time)), found.distance
 
     # A scan, because an unrolled loop would be compiled as many times over.
     time, gaps = jax.lax.scan(advance, jnp.zeros(a.radius.shape, state.dtype), length=contact.ADVANCES)
     found, arm1, arm2, relative, approach = closest_at(time)
     remaining = scene.dt - time
-    impact = contact.impact(jnp.maximum(-found.distance, 0.0), approach, 0.0, pair.surface, remaining)
+    gained = dv1 + jnp.cross(dw1, arm1) - dv2 - jnp.cross(dw2, arm2)
+    acceleration = jnp.sum(gained * found.normal, axis=-1) / scene.dt
+    impact = contact.impact(jnp.maximum(-found.distance, 0.0), approach, acceleration, pair.surface, remaining)
     lowest = jnp.minimum(gaps[0], found.distance)
     near = smooth_gate(lowest, 0.03)
     slide = relative - approach[..., None] * found.normal
 
+    given = compliance.compliance(scene, first, matrices, arm1, shape)
+    given += compliance.compliance(scene, second, matrices, arm2, shape)
+    along_normal = jnp.sum(given * found.normal[..., None, :], axis=-1)
+    mass = 1.0 / jnp.sum(along_normal * found.normal, axis=-1)
     up = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0], state.dtype), v1.shape)
-    context = _joint_context(scene, first, state, matrices, control)
-    vectors = jnp.stack([found.normal, arm1, relative, v1, w1, w2, up, *context], axis=-2)
-    local = _apply_inverse(turn, vectors)
+    vectors = [found.normal, arm1, relative, v1, w1, w2, up, dv1, dw1, mass[..., None] * along_normal]
+    local = _apply_inverse(turn, jnp.stack(vectors, axis=-2))
     scalars = jnp.stack(
         [
             jnp.clip(gaps[0], -0.1, 0.2),
@@ -268,35 +289,13 @@ def contact_inputs(scene: Scene, pair: Pair, state: Array, control: Array, shape
             impact.gap,
             b.centre[..., 2] - b.radius,
             v2[..., 2],
+            mass,
         ],
         axis=-1,
     )
     which = jnp.broadcast_to(jnp.eye(len(first), dtype=state.dtype), (*time.shape, len(first)))
     inputs = jnp.concatenate([local.reshape(*time.shape, -1), scalars, which], axis=-1)
-    m1, m2 = shape[..., first, 2], shape[..., second, 2]
-    return Touch(inputs, gaps[0], impact, near, found.normal, slide, arm1, arm2, m1 * m2 / (m1 + m2))
-
-
-def _joint_context(scene: Scene, rows: np.ndarray, state: Array, matrices: Array, control: Array) -> list[Array]:
-    """How each link is held: axis and spin of its parent and grandparent, and both joint targets, as world vectors."""
-    parent_of = {child: parent for child, parent, _ in scene.joints()}
-    motor_of = {
-        scene.rows(body.name).start + child: scene.motor_rows(body.name).start + index
-        for body in scene.bodies
-        for index, (child, _, _) in enumerate(body.motors)
-    }
-    spin = packed.angular_velocity(state)
-    context = []
-    link = list(rows)
-    for _ in range(2):
-        parents = [parent_of.get(int(row), int(row)) for row in link]
-        axes = jnp.array([scene.links[row].axis for row in parents], state.dtype)
-        context += [_apply(matrices[..., np.array(parents), :, :], axes), spin[..., np.array(parents), :]]
-        motors = np.array([motor_of.get(int(row), -1) for row in link])
-        target = control[..., motors, :] * (motors >= 0)[:, None] if control.shape[-2] else jnp.zeros_like(context[0])
-        context.append(_apply(matrices[..., np.array(parents), :, :], target))
-        link = parents
-    return context
+    return Touch(inputs, gaps[0], impact, near, found.normal, slide, arm1, arm2, mass)
 
 
 def paper_contact_inputs(scene: Scene, pair: Pair, state: Array, shape: Array) -> tuple[Array, Array]:
@@ -351,7 +350,6 @@ def first_contact(scene: Scene, states: Array) -> Array:
     if not scene.pairs:
         return jnp.full(states.shape[0], -1)
     shape = morphology(scene)[None]
-    idle = jnp.zeros((states.shape[0], len(scene.motors), 3), states.dtype)
     free = jnp.array([0.0, 0.0, -scene.gravity * scene.dt], states.dtype)
 
     def hit(before: Array, after: Array) -> Array:
@@ -359,7 +357,7 @@ def first_contact(scene: Scene, states: Array) -> Array:
         for pair in scene.pairs:
             _, second = pair_rows(scene, pair)
             pushed = contact.norm(packed.velocity(after) - packed.velocity(before) - free)[:, second] > 0.3
-            found |= jnp.any((contact_inputs(scene, pair, before, idle, shape).near > 0.1) & pushed, axis=1)
+            found |= jnp.any((contact_inputs(scene, pair, before, before, shape).near > 0.1) & pushed, axis=1)
         return found
 
     def advance(carry: None, step: tuple[Array, Array]) -> tuple[None, Array]:

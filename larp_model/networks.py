@@ -47,7 +47,7 @@ class Config:
 
 
 PAPER = Config("paper", 12, 512, 6, 128, 12, 128, "world", "velocity", "feature", skip=False)
-COMPACT = Config("compact", 6, 256, 3, 96, 2, 32, "heading", "change", "impulse", skip=True)
+COMPACT = Config("compact", 6, 256, 4, 128, 2, 32, "heading", "change", "impulse", skip=True)
 CONFIGS = {config.name: config for config in (PAPER, COMPACT)}
 
 

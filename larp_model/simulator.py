@@ -94,8 +94,11 @@ class Pooled(NamedTuple):
     travel: Array
 
 
-def contacts(scene: Scene, config: Config, weights: Weights, state: Array, control: Array, shape: Array) -> Pooled:
-    """Sum f_c over the contacts of every link (equation 1 of the paper). state (B, L, 13), control (B, J, 3)."""
+def contacts(scene: Scene, config: Config, weights: Weights, state: Array, free: Array, shape: Array) -> Pooled:
+    """Sum f_c over the contacts of every link (equation 1 of the paper).
+
+    state (B, L, 13); free (B, L, 13), what it would become if nothing touched.
+    """
     size, links = state.shape[0], len(scene.links)
     feature, travel = jnp.zeros((size, links, 6), state.dtype), jnp.zeros((size, links, 3), state.dtype)
     for pair in scene.pairs:
@@ -108,7 +111,7 @@ def contacts(scene: Scene, config: Config, weights: Weights, state: Array, contr
             for seen, rows in zip(inputs, (to_first, to_second), strict=True):
                 feature += jnp.einsum("bpf,pl->blf", network(seen), rows)
             continue
-        touch = features.contact_inputs(scene, pair, state, control, shape)
+        touch = features.contact_inputs(scene, pair, state, free, shape)
         outputs = bounded(network(touch.inputs), CONTACT_BOUNDS) * touch.near[..., None]
         impulse, lag = contact_impulse(touch, outputs)
         on_first = jnp.concatenate([-impulse, jnp.cross(touch.first_arm, -impulse)], axis=-1)
@@ -154,23 +157,43 @@ def step(
     torque = jnp.zeros((*state.shape[:-1], 3), state.dtype) if torque is None else torque
     shape = features.morphology(scene)[None] if shape is None else shape
     seen = jax.lax.stop_gradient(state) if stop_gradient else state
-    pooled = contacts(scene, config, weights, seen, control, shape)
+    none = jnp.zeros((state.shape[0], len(scene.links), 6), state.dtype)
+    free = seen
+    if scene.pairs and config.contact == "impulse":
+        # What the motors do meanwhile is no small part of an impact.
+        free = bodies_step(scene, config, weights, seen, control, torque, none, shape)
+        free = jax.lax.stop_gradient(free) if stop_gradient else free
+    pooled = contacts(scene, config, weights, seen, free, shape)
+    after = bodies_step(scene, config, weights, state, control, torque, pooled.feature, shape)
+    for body in scene.bodies:
+        rows = scene.rows(body.name)
+        if by_scalars(config, body):
+            own = Pooled(pooled.feature[:, rows], pooled.travel[:, rows])
+            ball = ball_step(scene, config, weights, body, state[:, rows], own, shape[:, rows])
+            after = after.at[:, rows].set(ball)
+    return after
+
+
+def bodies_step(
+    scene: Scene, config: Config, weights: Weights, state: Array, control: Array, torque: Array, pooled: Array,
+    shape: Array,
+) -> Array:  # fmt: skip
+    """One step of all bodies that have a dynamics network; balls by scalars stay as they are."""
     apart = features.displacement(scene, state, shape)
     parts, joint = [], 0
     for body in scene.bodies:
         rows, motors = scene.rows(body.name), scene.motor_rows(body.name)
-        own = Pooled(pooled.feature[:, rows], pooled.travel[:, rows])
-        if by_scalars(config, body):
-            parts.append(ball_step(scene, config, weights, body, state[:, rows], own, shape[:, rows]))
-            continue
         joints = slice(joint, joint + len(body.joints))
+        joint += len(body.joints)
+        if by_scalars(config, body):
+            parts.append(state[:, rows])
+            continue
         parts.append(
             body_step(
                 scene, config, weights, body, state[:, rows], control[:, motors], torque[:, rows], apart[:, joints],
-                own.feature, shape[:, rows],
+                pooled[:, rows], shape[:, rows],
             )
         )  # fmt: skip
-        joint += len(body.joints)
     return jnp.concatenate(parts, axis=1)
 
 
@@ -334,12 +357,14 @@ def initial_weights(scene: Scene, config: Config, key: Array, statistics: Measur
 def measure(scene: Scene, config: Config, before: Array, after: Array, control: Array, torque: Array) -> Measured:
     """Statistics of inputs and outputs by network, from true steps (B, L, 13) -> (B, L, 13).
 
-    Those of contacts are taken where there is one, for elsewhere their networks are not heard.
+    Those of contacts are taken where there is one, for elsewhere their networks are not heard; the true step stands
+    for the one without contact.
     """
     shape = features.morphology(scene)[None]
     apart, joint = features.displacement(scene, before, shape), 0
     pooled = jnp.zeros((*before.shape[:2], 6))
     rarely = 1e-3
+    free = after
     found: Measured = {}
     for body in scene.bodies:
         rows, motors = scene.rows(body.name), scene.motor_rows(body.name)
@@ -349,6 +374,7 @@ def measure(scene: Scene, config: Config, before: Array, after: Array, control: 
                 body, state[:, 0], pooled[:, rows][:, 0], shape[:, rows][:, 0], scene.gravity, scene.dt
             )
             found[dynamics_name(body)] = Statistics.of(ground.inputs, ground.near + rarely), None
+            free = free.at[:, rows].set(state)
             continue
         joints = slice(joint, joint + len(body.joints))
         joint += len(body.joints)
@@ -361,7 +387,7 @@ def measure(scene: Scene, config: Config, before: Array, after: Array, control: 
         statistics = features.body_statistics(Statistics.of(inputs), body)
         found[dynamics_name(body)] = statistics, Statistics.of(outputs)
     for pair in scene.pairs:
-        touch = features.contact_inputs(scene, pair, before, control, shape)
+        touch = features.contact_inputs(scene, pair, before, free, shape)
         near = touch.near.reshape(-1) + rarely
         if config.contact == "feature":
             seen = jnp.concatenate(features.paper_contact_inputs(scene, pair, before, shape), axis=1)

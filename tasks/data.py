@@ -10,11 +10,12 @@ from scipy.spatial.transform import Rotation
 from larp_model import features
 from larp_model import state as packed
 from larp_model.scene import Scene
+from larp_model.training import first_contacts
 from larp_model.truth.episodes import Episodes, record
 from larp_model.truth.mujoco import Truth
 from tasks.references import Reference
 
-STEPS = 70
+STEPS, CONTACT_STEPS = 70, 10
 # How far random joint targets stray from the reference, standard deviation by segment [rad]; the planner's too.
 STRAY = {
     "torso": 0.15,
@@ -100,8 +101,8 @@ def random_starts(
 def overlaps(scene: Scene, states: np.ndarray) -> np.ndarray:
     """(N,) which of the states (N, L, 13) have a link inside another that it can touch."""
     shape = features.morphology(scene)[None]
-    idle = jnp.zeros((len(states), len(scene.motors), 3))
-    gaps = [features.contact_inputs(scene, pair, jnp.asarray(states), idle, shape).gap for pair in scene.pairs]
+    still = jnp.asarray(states)
+    gaps = [features.contact_inputs(scene, pair, still, still, shape).gap for pair in scene.pairs]
     return np.asarray(jnp.concatenate(gaps, axis=1).min(axis=1) < 0.0)
 
 
@@ -136,6 +137,35 @@ def random_episodes(
     human = len(scene.bodies[0].links)
     torques[pushed, :10, :human] = 4.0 * random.standard_normal((len(pushed), 1, human, 3))
     return record(Truth(scene, batch=min(count, 256)), states, controls, torques)
+
+
+def contact_episodes(
+    scene: Scene, source: Episodes, count: int, seed: int, steps: int = CONTACT_STEPS
+) -> tuple[Episodes, int]:
+    """Short episodes that start just before first contacts of recorded ones, disturbed: impacts at a low price.
+
+    Returns them and how many diverged and were dropped.
+    """
+    random = np.random.default_rng(seed)
+    contacts = first_contacts(scene, source.states)
+    rows = random.choice(np.flatnonzero((contacts >= 0) & (contacts + steps <= source.steps)), count)
+    begin = np.maximum(contacts[rows] - random.integers(0, 4, count), 0)
+    states = source.states[rows, begin].astype(float)
+    columns = begin[:, None] + np.arange(steps)
+    human = len(scene.bodies[0].links)
+    size = random.uniform(0.0, 1.0, (count, 1, 1))
+    states[:, :human, packed.ANGULAR_VELOCITY] += 2.0 * size * random.standard_normal((count, human, 3))
+    states[:, 0, packed.VELOCITY] += 0.4 * size[:, 0] * random.standard_normal((count, 3))
+    ball = states[:, -1]
+    ball[:, packed.POSITION] += 0.03 * size[:, 0] * random.standard_normal((count, 3)) * (1.0, 1.0, 0.3)
+    ball[:, 2] = np.maximum(ball[:, 2], scene.bodies[-1].links[0].radius)
+    ball[:, packed.VELOCITY] *= random.uniform(0.5, 1.5, (count, 1))
+    controls = source.controls[rows[:, None], columns] + 0.5 * size[..., None] * smooth_noise(
+        random, count, steps, 4, stray(scene)
+    )
+    torques = source.torques[rows[:, None], columns]
+    apart = ~overlaps(scene, states)
+    return record(Truth(scene, batch=256), states[apart], controls[apart], torques[apart])
 
 
 def random_task(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
 from larp_model.bodies import standing_height
-from larp_model.scene import Body, Scene
+from larp_model.scene import Scene
 from larp_model.truth.mujoco import Truth, finite
-from tasks import bvh
-from tasks.key_poses import KEY_POSES, KEY_TIMES, START
+from tasks import bvh, key_poses
+from tasks.key_poses import KeyPoses
 from tasks.tracking import Tracker
 
 # Steps around the strike in which a captured kick may meet its ball.
@@ -44,52 +44,50 @@ class Reference:
         return self.states[rows + 1], self.controls[rows]
 
 
-def key_pose_controls(body: Body, steps: int, dt: float) -> np.ndarray:
-    """Joint targets (steps, J, 3) [rad] splined through the key poses, monotone between them."""
-    names = [body.links[child].name for child, _, _ in body.motors]
-    times = np.minimum(np.arange(steps) * dt, KEY_TIMES[-1])
-    controls = np.zeros((steps, len(names), 3))
-    for (joint, axis), angles in KEY_POSES.items():
-        controls[:, names.index(joint), axis] = PchipInterpolator(KEY_TIMES, angles)(times)
-    lower = np.array([motor.lower for _, _, motor in body.motors])
-    upper = np.array([motor.upper for _, _, motor in body.motors])
-    return np.clip(controls, lower, upper)
-
-
 def standing_on_ground(scene: Scene, targets: np.ndarray, root: Rotation) -> np.ndarray:
-    """The scene's state (L, 13) at rest with its human in the pose of joint targets (J, 3) [rad], on the ground.
+    """States (N, L, 13) at rest, the human in the poses of joint targets (N, J, 3) [rad], standing on the ground.
 
-    root: orientation of the pelvis, which is above the origin.
+    root: N orientations of the pelvis, which is above the origin.
     """
-    human = scene.bodies[0]
-    state = np.zeros((len(scene.links), packed.SIZE))
-    state[:, packed.ORIENTATION] = (1.0, 0.0, 0.0, 0.0)
+    human, count = scene.bodies[0], len(targets)
+    states = np.zeros((count, len(scene.links), packed.SIZE))
+    states[..., packed.ORIENTATION] = (1.0, 0.0, 0.0, 0.0)
+    motors = {child: index for index, (child, _, _) in enumerate(human.motors)}
     rotations = [root]
     for child, joint in enumerate(human.joints, start=1):
-        motors = [index for index, (row, _, _) in enumerate(human.motors) if row == child]
-        turn = Rotation.from_rotvec(targets[motors[0]] if motors else np.zeros(3))
-        rotations.append(rotations[joint.parent] * turn)
+        turn = targets[:, motors[child]] if child in motors else np.zeros((count, 3))
+        rotations.append(rotations[joint.parent] * Rotation.from_rotvec(turn))
     for row, rotation in enumerate(rotations):
-        state[row, packed.ORIENTATION] = rotation.as_quat(scalar_first=True)
-    truth = Truth(scene.only(human.name))
-    truth.reset(state[: len(human.links)])
-    closed = truth.state()[0]
-    lowest = min(
-        (closed[row, 2] - abs(0.5 * link.length * rotations[row].apply(link.axis)[2])) - link.radius
-        for row, link in enumerate(human.links)
+        states[:, row, packed.ORIENTATION] = rotation.as_quat(scalar_first=True)
+    truth = Truth(scene.only(human.name), batch=count)
+    truth.reset(states[:, : len(human.links)])
+    closed = truth.state()
+    lowest = np.min(
+        [
+            closed[:, row, 2] - abs(0.5 * link.length * rotations[row].apply(link.axis)[:, 2]) - link.radius
+            for row, link in enumerate(human.links)
+        ],
+        axis=0,
     )
-    closed[:, 2] -= lowest
-    state[: len(human.links)] = closed
-    return state
+    closed[..., 2] -= lowest[:, None]
+    states[:, : len(human.links)] = closed
+    return states
 
 
-def embedded(scene: Scene, steps: int = 300) -> Reference:
-    """The embedded kick, performed in the truth by the human of `scene` (its first body; its last is the ball)."""
+def starts(scene: Scene, poses: Sequence[KeyPoses]) -> np.ndarray:
+    """The states (N, L, 13) in which kicks of key poses begin."""
     human, ball = scene.bodies[0], scene.bodies[-1]
-    controls = key_pose_controls(human, steps, scene.dt)
-    state = standing_on_ground(scene, controls[0], Rotation.from_euler("xy", START["lean"]))
-    state[: len(human.links), packed.VELOCITY] = START["velocity"]
-    state[-1, packed.POSITION] = (*START["ball"], ball.links[0].radius)
+    first = np.concatenate([each.controls(human, 1, scene.dt) for each in poses])
+    states = standing_on_ground(scene, first, Rotation.from_euler("xy", [each.lean for each in poses]))
+    states[:, : len(human.links), packed.VELOCITY] = np.array([each.velocity for each in poses])[:, None]
+    states[:, -1, packed.POSITION] = [(*each.ball, ball.links[0].radius) for each in poses]
+    return states
+
+
+def embedded(scene: Scene, steps: int = 300, poses: KeyPoses | None = None) -> Reference:
+    """The embedded kick, performed in the truth by the human of `scene` (its first body; its last is the ball)."""
+    poses = key_poses.load() if poses is None else poses
+    controls, state = poses.controls(scene.bodies[0], steps, scene.dt), starts(scene, [poses])[0]
     truth = Truth(scene)
     after, finite = truth.rollout(state[None], controls[None])
     if not finite[0]:
@@ -156,7 +154,7 @@ def _wanted(scene: Scene, clip: bvh.Motion) -> tuple[np.ndarray, np.ndarray]:
     human, ball = scene.bodies[0], scene.bodies[-1]
     orientations, poses = bvh.retarget(clip, human, scene.dt)
     root = Rotation.from_quat(orientations, scalar_first=True)
-    states = np.stack([standing_on_ground(scene, pose, pelvis) for pose, pelvis in zip(poses, root, strict=True)])
+    states = standing_on_ground(scene, poses, root)
     rows = scene.rows(human.name)
     size = standing_height(human) / clip.hip_height
     way = size * (clip.path("Hips") - clip.path("Hips")[0])

@@ -245,14 +245,17 @@ def test_a_foot_that_crosses_the_ball_within_a_step_is_seen(scene: Scene) -> Non
     touches = []
     for speed in (16.0, 0.9 * gap / scene.dt):
         state[0, foot, packed.VELOCITY] = 0.0, speed, 0.0
-        control, shape = jnp.zeros((1, len(scene.motors), 3)), features.morphology(scene)[None]
-        touches.append(seen(jnp.asarray(state), control, shape))
-    fast, slow = touches
+        touches.append(seen(jnp.asarray(state), jnp.asarray(state), features.morphology(scene)[None]))
+    free = state.copy()
+    free[0, foot, packed.VELOCITY] *= 1.5  # it speeds up, and arrives after all
+    touches.append(seen(jnp.asarray(state), jnp.asarray(free), features.morphology(scene)[None]))
+    fast, slow, faster = touches
     struck = scene.pairs[0].first_links.index("right_foot")
     assert fast.near[0, struck] == 1.0 and (np.delete(np.asarray(fast.near[0]), struck) == 0.0).all()
     np.testing.assert_allclose(fast.normal[0, struck], [0.0, 1.0, 0.0], atol=1e-6)
     assert float(fast.impact.change[0, struck]) > 16.0
     assert float(slow.impact.change[0, struck]) == pytest.approx(0.0, abs=1e-6)
+    assert float(faster.impact.change[0, struck]) > 0.1
 
 
 def integrated(

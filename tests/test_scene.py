@@ -141,17 +141,29 @@ def test_a_human_has_its_mass_and_stands_on_its_height(height: float, mass: floa
     assert 0.5 * height < standing_height(body) < 0.6 * height
 
 
-def test_a_human_is_as_tall_as_it_says() -> None:
-    body = human()
-    top = standing_height(body)
-    for child in (1, 2):
-        joint, parent = body.joints[child - 1], body.links[body.joints[child - 1].parent]
+def joint_heights(body: Body) -> dict[str, float]:
+    """Height of each link's joint above the ground in the rest pose [m], and of the top of the head."""
+    centres, heights = [standing_height(body)], {}
+    for child, joint in enumerate(body.joints, start=1):
+        link, parent = body.links[child], body.links[joint.parent]
         up = anchor(joint.parent_anchor, np.array(parent.length), np.array(parent.radius), parent.axis)
-        down = anchor(joint.child_anchor, np.array(body.links[child].length), np.array(body.links[child].radius),
-                      body.links[child].axis)  # fmt: skip
-        top += up[2] - down[2]
+        down = anchor(joint.child_anchor, np.array(link.length), np.array(link.radius), link.axis)
+        heights[link.name] = centres[joint.parent] + up[2]
+        centres.append(heights[link.name] - down[2])
     head = body.links[body.link("head")]
-    assert top + 0.5 * head.length + head.radius == pytest.approx(1.75, rel=0.06)
+    return heights | {"top": centres[body.link("head")] + 0.5 * head.length + head.radius}
+
+
+def test_a_human_is_as_tall_as_it_says() -> None:
+    assert joint_heights(human(height=1.9))["top"] == pytest.approx(1.9, rel=0.005)
+
+
+def test_joints_are_at_the_heights_of_drillis_and_contini() -> None:
+    heights = joint_heights(human(height=1.75))
+    published = {"left_upper_arm": 0.818, "left_thigh": 0.530, "left_shin": 0.285, "left_foot": 0.039}
+    published["left_lower_arm"] = 0.818 - 0.186
+    for name, share in published.items():
+        assert heights[name] == pytest.approx(share * 1.75, abs=0.01), name
 
 
 def test_the_right_side_mirrors_the_left() -> None:

@@ -63,7 +63,7 @@ def test_momentum_is_kept_without_gravity() -> None:
     scene = Scene((human(),), gravity=0.0)
     random = np.random.default_rng(0)
     truth = Truth(scene, batch=4)
-    start = standing_on_ground(scene, np.zeros((12, 3)), Rotation.identity()) + np.eye(13)[2] * 5.0
+    start = standing_on_ground(scene, np.zeros((1, 12, 3)), Rotation.identity(1))[0] + np.eye(13)[2] * 5.0
     start = np.tile(start, (4, 1, 1))
     start[..., packed.VELOCITY] = random.standard_normal((4, 1, 3))
     start[..., packed.ANGULAR_VELOCITY] = random.standard_normal((4, 13, 3))
@@ -86,7 +86,7 @@ def test_momentum_is_kept_without_gravity() -> None:
 
 def test_a_standing_human_stays_up() -> None:
     scene = Scene((human(),))
-    start = standing_on_ground(scene, np.zeros((12, 3)), Rotation.identity())
+    start = standing_on_ground(scene, np.zeros((1, 12, 3)), Rotation.identity(1))[0]
     assert start[0, 2] == pytest.approx(standing_height(human()), abs=1e-9)
     after, finite = Truth(scene).rollout(start[None], np.zeros((1, 100, 12, 3)))
     assert finite.all() and after[0, :, 0, 2].min() > 0.9 * start[0, 2]

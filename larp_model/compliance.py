@@ -1,0 +1,97 @@
+"""How much a link gives way to an impulse: it drags along its parents, through joints that hold fast or loosely.
+
+Newton-Euler for one link, its joint's other side yielding by W_p, propagated outwards from the root (as in
+R. Featherstone, Rigid Body Dynamics Algorithms (2008), 7.4). With j the joint, and G_xy = 1/m - [x] I^-1 [y] what the
+free link yields at x to an impulse at y,
+
+    W(x) = G_xx - G_xj (G_jj + W_p)^-1 G_jx
+
+Joints carry no moment here. What does stiffen them during an impact, the motor's armature and damping, is counted as
+inertia of the outer link.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from larp_model.scene import Motor, Scene
+
+# For how long a motor's damping acts during an impact, as far as its armature-like effect goes [s].
+HELD = 0.002
+
+
+def moments(length: Array, radius: Array, mass: Array) -> tuple[Array, Array]:
+    """Moments of inertia (*,) [kg m^2] of solid capsules, about their axis and across it."""
+    sphere = 4.0 / 3.0 * radius / (length + 4.0 / 3.0 * radius)
+    rod, caps = mass * (1.0 - sphere), mass * sphere
+    along = (0.5 * rod + 0.4 * caps) * radius**2
+    across = rod * (length**2 / 12.0 + radius**2 / 4.0)
+    across += caps * (0.4 * radius**2 + length**2 / 4.0 + 0.375 * length * radius)
+    return along, across
+
+
+def _holding(motor: Motor | None, damping: float) -> float:
+    return HELD * damping if motor is None else motor.armature + HELD * motor.damping
+
+
+def compliance(scene: Scene, rows: np.ndarray, matrices: Array, points: Array, shape: Array) -> Array:
+    """Velocity gained per impulse, (B, P, 3, 3) [1/kg], by a point of each of P links, in world axes.
+
+    rows: (P,) the links. matrices: (B, L, 3, 3) rotations of all links. points: (B, P, 3) [m] from the links' centres.
+    shape: morphology (B or 1, L, 3).
+    """
+    joints = {child: (parent, joint) for child, parent, joint in scene.joints()}
+    stiff: dict[int, Array] = {}  # (G_jj + W_p)^-1 by link
+
+    def inertia(row: int) -> tuple[Array, Array]:
+        """1/m (B, 1, 1) and I^-1 (B, 3, 3)."""
+        length, radius, mass = shape[..., row, 0], shape[..., row, 1], shape[..., row, 2]
+        along, across = moments(length, radius, mass)
+        held = _holding(joints[row][1].motor, joints[row][1].damping) if row in joints else 0.0
+        along, across = (along + held)[..., None, None], (across + held)[..., None, None]
+        axis = matrices[..., row, :, :] @ jnp.asarray(scene.links[row].axis, matrices.dtype)
+        outer = axis[..., :, None] * axis[..., None, :]
+        return 1.0 / mass[..., None, None], (jnp.eye(3) - outer) / across + outer / along
+
+    def place(row: int, point: tuple[float, float, float]) -> Array:
+        axis = np.asarray(scene.links[row].axis)
+        along = axis @ point * axis
+        offset = 0.5 * shape[..., row, 0:1] * along + shape[..., row, 1:2] * (np.asarray(point) - along)
+        return jnp.sum(matrices[..., row, :, :] * offset[..., None, :], axis=-1)
+
+    def yields(row: int, point: Array) -> Array:
+        """W at a point (B, 3) of a link."""
+        lightness, inverse = inertia(row)
+        cross_point = skew(point)
+        free = lightness * jnp.eye(3) - cross_point @ inverse @ cross_point
+        if row not in joints:
+            return free
+        parent, joint = joints[row]
+        arm = place(row, joint.child_anchor)
+        cross_arm = skew(arm)
+        if row not in stiff:
+            at_arm = lightness * jnp.eye(3) - cross_arm @ inverse @ cross_arm
+            stiff[row] = invert(at_arm + yields(parent, place(parent, joint.parent_anchor)))
+        across = lightness * jnp.eye(3) - cross_point @ inverse @ cross_arm
+        return free - across @ stiff[row] @ jnp.swapaxes(across, -1, -2)
+
+    return jnp.stack([yields(int(row), points[..., index, :]) for index, row in enumerate(rows)], axis=-3)
+
+
+def skew(vector: Array) -> Array:
+    """Matrices (*, 3, 3) of the cross product with vectors (*, 3)."""
+    x, y, z = jnp.moveaxis(vector, -1, 0)
+    zero = jnp.zeros_like(x)
+    return jnp.stack(
+        [jnp.stack([zero, -z, y], -1), jnp.stack([z, zero, -x], -1), jnp.stack([-y, x, zero], -1)], axis=-2
+    )
+
+
+def invert(matrix: Array) -> Array:
+    """Inverses of regular matrices (*, 3, 3), by their adjugates: far quicker in batches than a solver."""
+    a, b, c = matrix[..., 0, :], matrix[..., 1, :], matrix[..., 2, :]
+    adjugate = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=-1)
+    determinant = jnp.sum(a * adjugate[..., :, 0], axis=-1)
+    return adjugate / determinant[..., None, None]
