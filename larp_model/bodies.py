@@ -68,7 +68,9 @@ def capsule(
 
 def chain(name: str = "chain", links: int = 4, length: float = 0.3, radius: float = 0.06, mass: float = 1.0) -> Body:
     """Capsules in a row, tied end to end by ball joints without motors. length, radius [m], mass of each [kg]."""
-    _positive(links=links, length=length, radius=radius, mass=mass)
+    if not isinstance(links, int) or links < 1:
+        raise ValueError(f"links is {links!r}, but must be an integer of at least 1")
+    _positive(length=length, radius=radius, mass=mass)
     parts = tuple(Link(f"link{i}", length, radius, mass) for i in range(links))
     reach = (0.0, 0.0, 1.0 + 2.0 * radius / length)
     down = (0.0, 0.0, -reach[2])

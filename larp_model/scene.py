@@ -199,14 +199,17 @@ class Scene:
         names = [body.name for body in self.bodies]
         if not names or len(set(names)) != len(names):
             raise ValueError(f"scene.bodies are named {names}, but need one or more different names")
+        met = [tuple(sorted((pair.first, pair.second))) for pair in self.pairs]
+        if len(set(met)) != len(met):
+            raise ValueError(f"scene.pairs are of {met}, but two bodies may be named together once")
         for pair in self.pairs:
             if pair.first == pair.second:
                 raise ValueError(
                     f"scene.pairs names {pair.first!r} twice: contact of a body with itself is not modelled"
                 )
             for name, links in ((pair.first, pair.first_links), (pair.second, pair.second_links)):
-                if not links:
-                    raise ValueError(f"scene.pairs names no link of {name!r}, but needs at least one")
+                if not links or len(set(links)) != len(links):
+                    raise ValueError(f"scene.pairs names the links {links} of {name!r}, but needs some, each once")
                 for link in links:
                     self.body(name).link(link)
 

@@ -5,20 +5,22 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from safetensors.numpy import load as parse
 from safetensors.numpy import save as serialise
 
+from larp_model import state as packed
 from larp_model.features import Statistics
+from larp_model.files import write_whole
 from larp_model.networks import Config
 from larp_model.scene import Scene
-from larp_model.simulator import Weights
+from larp_model.simulator import Weights, initial_weights, measure
 
 VERSION = 1
 SHIPPED = Path(__file__).parent / "weights"
@@ -29,9 +31,9 @@ def signature(scene: Scene) -> str:
     return hashlib.sha256(json.dumps(dataclasses.asdict(scene), sort_keys=True).encode()).hexdigest()[:16]
 
 
-def flatten(weights: Weights) -> dict[str, np.ndarray]:
+def flatten(weights: Weights) -> dict[str, Any]:
     """Weights as named arrays."""
-    arrays: dict[str, np.ndarray] = {}
+    arrays: dict[str, Any] = {}
 
     def visit(prefix: str, node: Any) -> None:
         if isinstance(node, Mapping):
@@ -40,7 +42,7 @@ def flatten(weights: Weights) -> dict[str, np.ndarray]:
         elif isinstance(node, Statistics):
             visit(prefix, node._asdict())
         else:
-            arrays[prefix.removeprefix(":")] = np.ascontiguousarray(node, np.float32)
+            arrays[prefix.removeprefix(":")] = node
 
     visit("", weights._asdict())
     return arrays
@@ -67,7 +69,8 @@ def save(folder: Path, name: str, scene: Scene, config: Config, weights: Weights
 
     recipe: how and on what the weights were trained, and their scores; anything JSON holds.
     """
-    tensors = serialise(flatten(weights))
+    arrays = {name: np.ascontiguousarray(array, np.float32) for name, array in flatten(weights).items()}
+    tensors = serialise(arrays)
     manifest = {
         "version": VERSION,
         "config": dataclasses.asdict(config),
@@ -75,17 +78,10 @@ def save(folder: Path, name: str, scene: Scene, config: Config, weights: Weights
         "sha256": hashlib.sha256(tensors).hexdigest(),
         "recipe": recipe,
     }
-    folder.mkdir(parents=True, exist_ok=True)
     # Tensors first: a crash between the two leaves a manifest whose hash refuses them, not a silent mixture.
-    _write(folder / f"{name}.safetensors", tensors)
-    _write(folder / f"{name}.json", (json.dumps(manifest, indent=2) + "\n").encode())
+    write_whole(folder / f"{name}.safetensors", tensors)
+    write_whole(folder / f"{name}.json", (json.dumps(manifest, indent=2) + "\n").encode())
     return folder / f"{name}.json"
-
-
-def _write(path: Path, content: bytes) -> None:
-    temporary = path.with_name(f".{path.name}.partial")
-    temporary.write_bytes(content)
-    os.replace(temporary, path)
 
 
 def load(manifest: Path, scene: Scene) -> tuple[Config, Weights, dict[str, Any]]:
@@ -108,4 +104,27 @@ def load(manifest: Path, scene: Scene) -> tuple[Config, Weights, dict[str, Any]]
     raw = tensors_path.read_bytes()
     if hashlib.sha256(raw).hexdigest() != expected:
         raise ValueError(f"weights file {tensors_path} is damaged: its sha256 is not the one in {manifest.name}")
-    return config, unflatten(parse(raw)), content
+    arrays = parse(raw)
+    _check_shapes(tensors_path, arrays, shapes(scene, config))
+    return config, unflatten(arrays), content
+
+
+def shapes(scene: Scene, config: Config) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of the tensors of a scene's weights."""
+
+    def make() -> Weights:
+        state = jnp.zeros((1, len(scene.links), packed.SIZE))
+        control, torque = jnp.zeros((1, len(scene.motors), 3)), jnp.zeros((1, len(scene.links), 3))
+        return initial_weights(scene, config, jax.random.key(0), measure(scene, config, state, state, control, torque))
+
+    return {name: tensor.shape for name, tensor in flatten(jax.eval_shape(make)).items()}
+
+
+def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray], needed: Mapping[str, tuple[int, ...]]) -> None:
+    if set(arrays) != set(needed):
+        odd = sorted(set(arrays) ^ set(needed))
+        raise ValueError(f"weights file {path} and its config differ in the tensors {odd}")
+    for name, shape in needed.items():
+        found = arrays[name].shape
+        if found != shape:
+            raise ValueError(f"weights file {path}: {name} has shape {found}, but its config needs {shape}")

@@ -33,6 +33,7 @@ from rich.table import Table
 from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.bodies import human_and_ball, standing_height
+from larp_model.files import write_whole
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from larp_model.truth.mujoco import Truth
@@ -42,7 +43,6 @@ from tasks import references
 from tasks.data import stray
 from tasks.references import Reference
 from viewer import LivePage, Recording, kick_picture, nearest_approach, write_html
-from viewer.recording import write_whole
 
 HORIZON = 60
 FLIGHT = 110

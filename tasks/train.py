@@ -88,7 +88,8 @@ def stored_episodes(path: Path, scene: Scene, make: Callable[[], tuple[Episodes,
         begin = time.perf_counter()
         episodes, dropped = make()
         truth_episodes.save(path, scene, episodes)
-        console.print(f"{path.name}: {len(episodes)} episodes, {dropped} diverged, {time.perf_counter() - begin:.0f} s")
+        seconds = time.perf_counter() - begin
+        console.print(f"{path.name}: {len(episodes.states)} episodes, {dropped} diverged, {seconds:.0f} s")
     return truth_episodes.load(path, scene)
 
 
@@ -143,7 +144,7 @@ def main(
             {
                 "stage": stage.name,
                 "recipe": asdict(recipe),
-                "sources": [{"episodes": len(source), "steps": source.steps, "share": share} for source, share in used],
+                "sources": [{"episodes": len(source.states), "steps": source.steps} for source, _ in used],
                 "seconds": log["seconds"],
                 "dropped": log["dropped"],
                 "stopped_early": log["stopped_early"],

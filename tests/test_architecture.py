@@ -11,6 +11,7 @@ ROOT = Path(__file__).parents[1]
 # A module imports only from modules listed before it, so a new file goes below all that it imports.
 # A package's own name is its __init__.py, which re-exports what stands above.
 ORDER = [
+    "larp_model.files",
     "larp_model.scene",
     "larp_model.bodies",
     "larp_model.state",

@@ -103,7 +103,7 @@ def test_a_football_rebounds_as_the_rules_ask() -> None:
 
 
 def test_a_state_survives_a_reset(scene: Scene, episodes: Episodes) -> None:
-    truth = Truth(scene, batch=len(episodes))
+    truth = Truth(scene, batch=len(episodes.states))
     truth.reset(episodes.states[:, -1].astype(float))
     once = truth.state()
     truth.reset(once)

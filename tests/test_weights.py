@@ -123,3 +123,13 @@ def test_a_configuration_that_makes_no_sense_is_refused(stored: Path, scene: Sce
     content["config"][field] = value
     stored.write_text(json.dumps(content))
     assert field in refusal(stored, scene)
+
+
+@pytest.mark.parametrize(("change", "says"), [({"width": 32}, "has shape"), ({"layers": 3}, "differ in the tensors")])
+def test_tensors_that_do_not_fit_their_config_are_refused(
+    change: dict[str, int], says: str, stored: Path, scene: Scene
+) -> None:
+    content = json.loads(stored.read_text())
+    content["config"] |= change
+    stored.write_text(json.dumps(content))
+    assert says in refusal(stored, scene)

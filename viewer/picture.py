@@ -16,9 +16,10 @@ from matplotlib.patches import Circle, Polygon
 from matplotlib.ticker import MaxNLocator
 from scipy.spatial.transform import Rotation
 
+from larp_model.files import write_whole
 from larp_model.scene import Scene
 from larp_model.state import ORIENTATION, POSITION, VELOCITY
-from viewer.recording import Recording, nearest_approach, write_whole
+from viewer.recording import Recording, nearest_approach
 from viewer.scene_view import PREDICTION, TARGET, TRUTH, Colour, link_colour
 
 WIDTH, HEIGHT, DOTS = 18.0, 10.0, 100  # inches, inches, dots per inch

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -106,18 +103,3 @@ class Recording:
         if self.reference is None or row >= len(self.reference):
             return None
         return np.asarray(self.reference[row])
-
-
-def write_whole(path: str | Path, data: bytes) -> None:
-    """Write a file, making its folder, so that nobody ever sees half of it."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
-        try:
-            os.chmod(file.name, 0o644)  # temporary files are born private
-            file.write(data)
-            file.close()
-            os.replace(file.name, path)
-        except BaseException:
-            os.unlink(file.name)
-            raise

@@ -5,8 +5,9 @@ from __future__ import annotations
 from html import escape
 from pathlib import Path
 
+from larp_model.files import write_whole
 from viewer.app import close_server, open_server
-from viewer.recording import Recording, write_whole
+from viewer.recording import Recording
 from viewer.stage import LEGEND, Stage
 
 FRAME = 0.02  # s of recorded time between two pictures

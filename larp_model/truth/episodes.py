@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from larp_model import state as packed
+from larp_model.files import written_whole
 from larp_model.scene import Scene
 from larp_model.truth.mujoco import Truth
 
@@ -27,9 +27,6 @@ class Episodes(NamedTuple):
     states: np.ndarray
     controls: np.ndarray
     torques: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.states)
 
     @property
     def steps(self) -> int:
@@ -76,11 +73,8 @@ def join(parts: Sequence[Episodes]) -> Episodes:
 def save(path: Path, scene: Scene, episodes: Episodes) -> None:
     """Write episodes to an .npz file, whole or not at all."""
     header = json.dumps({"version": VERSION, "dt": scene.dt, "links": [link.name for link in scene.links]})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.partial")
-    with temporary.open("wb") as file:
+    with written_whole(path) as file:
         np.savez(file, header=np.array(header), **episodes._asdict())
-    os.replace(temporary, path)
 
 
 def load(path: Path, scene: Scene) -> Episodes:

@@ -70,7 +70,8 @@ def main(
     source = f"--states {states.name}" if states else f"--sequences {sequences} --seed {seed}"
     command = f"python -m tasks.benchmarks.model --scene {scene} {source}"
     report.write_json(json, {"command": command, "hardware": report.hardware(), "config": config.name, **found})
-    report.write_picture(json.with_suffix(".png"), picture(found["windows"], f"{scene}: {len(episodes)} sequences"))
+    title = f"{scene}: {len(episodes.states)} sequences"
+    report.write_picture(json.with_suffix(".png"), picture(found["windows"], title))
     table = Table("measure", *(f"{n} steps" for n in WINDOWS), title=f"Model: {scene}")
     for body, paper in PAPER.items():
         table.add_row(f"{body}, position error", *(f"{found['windows'][str(n)][body]:.4f} m" for n in WINDOWS))

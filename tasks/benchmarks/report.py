@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-from viewer.recording import write_whole
+from larp_model.files import write_whole, written_whole
 
 RESULTS = Path("RESULTS.md")
 
@@ -40,10 +40,8 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 def write_picture(path: Path, figure: Figure) -> None:
     """Write a figure as PNG."""
     FigureCanvasAgg(figure)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.partial")
-    figure.savefig(temporary, format="png", dpi=120)
-    os.replace(temporary, path)
+    with written_whole(path) as file:
+        figure.savefig(file, format="png", dpi=120)
 
 
 def publish(name: str, title: str, command: str, table: Table) -> None:
