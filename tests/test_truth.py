@@ -216,12 +216,12 @@ def stored(tmp_path: Path, scene: Scene, episodes: Episodes) -> Path:
 
 def test_what_is_saved_is_what_is_loaded(stored: Path, scene: Scene, episodes: Episodes) -> None:
     loaded = load(stored, scene)
-    assert len(loaded) == 3 and loaded.steps == 30
+    assert len(loaded.states) == 3 and loaded.steps == 30
     for name in Episodes._fields:
         np.testing.assert_array_equal(getattr(loaded, name), getattr(episodes, name)[:3])
     assert [file.name for file in stored.parent.iterdir()] == ["episodes.npz"]
     twice = join([loaded, loaded])
-    assert len(twice) == 6 and twice.steps == 30
+    assert len(twice.states) == 6 and twice.steps == 30
 
 
 def rewrite(path: Path, **changes: np.ndarray) -> None:
