@@ -123,9 +123,7 @@ def _axis(orientation: np.ndarray, axis: int) -> np.ndarray:
     return np.stack(columns[axis], axis=-1)
 
 
-def disturbances(
-    random: np.random.Generator, scene: Scene, kicks: int, size: float
-) -> tuple[np.ndarray, np.ndarray]:
+def disturbances(random: np.random.Generator, scene: Scene, kicks: int, size: float) -> tuple[np.ndarray, np.ndarray]:
     """Shifts of the ball (kicks, 2) [m] and noise on joint targets (kicks, WATCHED, J, 3) [rad]; none on the first."""
     shift = size * random.uniform(-SHIFT, SHIFT, (kicks, 2))
     noise = np.zeros((kicks, WATCHED, len(scene.motors), 3))

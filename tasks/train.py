@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -37,10 +37,10 @@ LOSS = LossWeights(velocity=1e-2, far=0.05, fast=0.1)
 
 
 class Stage(NamedTuple):
-    """A part of the training: what it is called, whether it adds the planner's candidates first, and how it trains."""
+    """A part of the training: what it is called, which episodes it adds first, if any, and how it trains."""
 
     name: str
-    planned: bool
+    adds: Literal["", "planned", "contacts"]
     recipe: training.Recipe
 
 
@@ -49,14 +49,14 @@ class Stage(NamedTuple):
 HUMAN, IMPACTS = ("dynamics/human",), ("dynamics/ball", "contact")
 STEPS = training.Recipe(6000, 512, ((1, 1.0),), learning_rate=1e-3, before_contact=2, after_contact=3, loss=LOSS)
 ROLLOUTS = training.Recipe(8000, 256, ((4, 0.1), (8, 0.2), (20, 0.7)), learning_rate=5e-4, loss=LOSS, only=HUMAN)
+AGAIN = replace(ROLLOUTS, updates=2000, curriculum=((20, 1.0),), learning_rate=2e-4)
 STAGES = (
-    Stage("steps", False, STEPS),
-    Stage("rollouts", False, ROLLOUTS),
-    Stage("planned1", True, replace(ROLLOUTS, updates=2000, curriculum=((20, 1.0),), learning_rate=2e-4)),
+    Stage("steps", "", STEPS),
+    Stage("rollouts", "", ROLLOUTS),
+    Stage("planned1", "planned", AGAIN),
+    Stage("struck", "contacts", replace(AGAIN, updates=3000)),
     Stage(
-        "impacts",
-        False,
-        replace(STEPS, updates=15000, contact_share=0.9, before_contact=1, after_contact=2, only=IMPACTS),
+        "impacts", "", replace(STEPS, updates=30000, contact_share=0.9, before_contact=1, after_contact=2, only=IMPACTS)
     ),
 )
 
@@ -80,6 +80,23 @@ def planned_episodes(kick: Kick, weights: Path, tasks: int, elites: int, seed: i
                 states.append(execution.states[replan.step])
                 controls.append(first.controls(replan.plan._replace(elites=knots[None]), window))
     return truth_episodes.record(Truth(kick.scene, 128), np.stack(states), np.stack(controls))
+
+
+def on_policy_contacts(
+    scene: Scene, random: Episodes, planned: Episodes, count: int, seed: int
+) -> tuple[Episodes, int]:
+    """Contacts of random episodes and of the planner's candidates, disturbed: `count` of each, as long as a rollout.
+
+    Returns the episodes and how many diverged.
+    """
+    made, dropped = zip(
+        *(
+            contact_episodes(scene, source, count, seed + number, AGAIN.curriculum[0][0] + 5)
+            for number, source in enumerate((random, planned))
+        ),
+        strict=True,
+    )
+    return truth_episodes.join(made), sum(dropped)
 
 
 def stored_episodes(path: Path, scene: Scene, make: Callable[[], tuple[Episodes, int]], console: Console) -> Episodes:
@@ -126,9 +143,12 @@ def main(
     rounds: list[dict[str, Any]] = []
     manifest = Path()
     for number, stage in enumerate(STAGES):
-        if stage.planned:
-            make = partial(planned_episodes, kick, manifest, tasks, 8, seed + 1000 * number)
-            sources.append(stored_episodes(folder / f"{stage.name}.npz", scene, make, console))
+        if stage.adds:
+            makers = {
+                "planned": partial(planned_episodes, kick, manifest, tasks, 8, seed + 1000 * number),
+                "contacts": partial(on_policy_contacts, scene, random, sources[-1], 2 * episodes, seed + 1000 * number),
+            }
+            sources.append(stored_episodes(folder / f"{stage.name}.npz", scene, makers[stage.adds], console))
         manifest = folder / stage.name / f"{WEIGHTS}.json"
         if manifest.exists():
             _, learned, content = stored.load(manifest, scene)
