@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -29,10 +29,32 @@ class Window(NamedTuple):
     context: Any
 
 
+def never(state: np.ndarray) -> bool:
+    """No state ends the phase."""
+    return False
+
+
+class Phase(NamedTuple):
+    """A part of an execution: who plans in it, and for what.
+
+    first: the planner of its first plan; again: of all later ones, every `every` steps. Both share horizon, knots and
+    elites. window: what is wanted from a step on. over: the states (L, 13) in which the next phase begins, or, after
+    the last, planning ends. links: those that the planners' dynamics know.
+    """
+
+    first: Planner
+    again: Planner
+    every: int
+    window: Callable[[int], Window]
+    over: Callable[[np.ndarray], bool] = never
+    links: slice = slice(None)
+
+
 class Replan(NamedTuple):
-    """One planning step: when it was made, the plan and what was found."""
+    """One planning step: when it was made, in which phase, the plan and what was found."""
 
     step: int
+    phase: int
     plan: Plan
     info: PlanInfo
 
@@ -49,36 +71,34 @@ class Execution:
 def execute(
     world: World,
     state: np.ndarray,
-    first: Planner,
-    again: Planner,
-    window: Callable[[int], Window],
+    phases: Sequence[Phase],
     steps: int,
-    every: int,
-    keep_planning: Callable[[np.ndarray], bool],
     key: jax.Array,
     dt: float,
     observe: Callable[[Execution], None] = lambda execution: None,
 ) -> Execution:
-    """Plan with `first` in `state` (L, 13), execute, and replan with `again` every `every` steps from the true state.
+    """Plan in the true state, from state (L, 13) on, execute and plan again, one phase after the other.
 
-    Planning ends for good when `keep_planning(state)` is false; the last plan is then carried out, and after its end
-    the task's reference. Both planners share horizon, knots and elites. `observe` is called after every step.
+    After the last phase its plan is carried out, and after the plan's end the task's reference. `observe` is called
+    after every step.
     """
     world.reset(state[None])
     execution = Execution([np.asarray(state)])
-    plan, planned_at, planning = first.init(key), 0, True
-    targets = np.zeros(0)
+    index, plan, planned_at, targets = 0, None, 0, np.zeros(0)
     for step in range(steps):
         current = execution.states[-1]
-        planning = planning and keep_planning(current)
-        if planning and step % every == 0:
-            wanted = window(step)
-            planner = again if step else first
-            plan, info = planner.step(plan, current, wanted.controls, wanted.context, now=step * dt)
+        while index < len(phases) and phases[index].over(current):
+            index, plan = index + 1, None
+        phase = phases[min(index, len(phases) - 1)]
+        if index < len(phases) and (plan is None or step - planned_at >= phase.every):
+            planner = phase.first if plan is None else phase.again
+            before = planner.init(jax.random.fold_in(key, index), step * dt) if plan is None else plan
+            wanted = phase.window(step)
+            plan, info = planner.step(before, current[phase.links], wanted.controls, wanted.context, now=step * dt)
             targets, planned_at = np.asarray(planner.controls(plan, wanted.controls)), step
-            execution.replans.append(Replan(step, plan, info))
+            execution.replans.append(Replan(step, index, plan, info))
         ahead = step - planned_at
-        control = targets[ahead] if ahead < len(targets) else window(step).controls[0]
+        control = targets[ahead] if ahead < len(targets) else phase.window(step).controls[0]
         execution.controls.append(control)
         execution.states.append(world.step(control[None])[0])
         observe(execution)

@@ -20,7 +20,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,10 +38,11 @@ from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from larp_model.truth.mujoco import Truth
 from mpc import CEM, Continued, CostTerm, Dynamics, Gradient, MujocoDynamics, Planner, l2, nearest_on_path, quadratic
-from mpc.loop import Execution, Window, execute
+from mpc.loop import Execution, Phase, Replan, Window, execute
 from tasks import references
 from tasks.data import stray
 from tasks.references import Reference
+from tasks.standing import Standing
 from viewer import LivePage, Recording, kick_picture, nearest_approach, write_html
 
 HORIZON = 60
@@ -50,6 +51,7 @@ FLIGHT = 110
 SEARCH = 0.5
 KNOTS = 9
 AFTER_CONTACT = 200
+STAND_EVERY = 4
 REACHABLE = 0.25
 WEIGHTS = "human_ball"
 # Rows that MuJoCo, as the planner's model, rolls out side by side.
@@ -60,11 +62,32 @@ DynamicsName = Literal["larp", "mujoco"]
 
 @dataclass(frozen=True)
 class Preset:
-    """How much a plan may cost: the optimisers of the first plan and of each replan, and steps between replans."""
+    """How much a plan may cost: the optimisers of the first plan and of each replan, and steps between replans.
+
+    stand: optimisers of the plans that keep the human up after the kick.
+    """
 
     first: tuple[CEM | Gradient, ...]
     again: tuple[CEM | Gradient, ...]
     every: int
+    stand: tuple[CEM | Gradient, ...] = (CEM(samples=64, rounds=2, elites=12, decay=1.0),)
+
+
+class Models(NamedTuple):
+    """The planners' models of the scene and of the human alone, and which weights they have."""
+
+    whole: Dynamics
+    human: Dynamics
+    weights: str
+
+
+class Planners(NamedTuple):
+    """Planners of the first kick plan, of later ones, every `every` steps, and of what follows the kick."""
+
+    first: Planner
+    again: Planner
+    every: int
+    stand: Planner
 
 
 # One population size throughout, because every size is compiled apart.
@@ -173,8 +196,7 @@ class Kick:
 
     def run(
         self,
-        planners: tuple[Planner, Planner],
-        every: int,
+        planners: Planners,
         target: np.ndarray,
         seed: int,
         ball_offset: np.ndarray | tuple[float, float] = (0.0, 0.0),
@@ -185,24 +207,30 @@ class Kick:
         state = self.start(ball_offset)
         spot = state[self.ball, :3]
 
-        def untouched(current: np.ndarray) -> bool:
+        def touched(current: np.ndarray) -> bool:
             return bool(
-                np.linalg.norm(current[self.ball, packed.VELOCITY]) < 0.5
-                and abs(current[self.ball, :3] - spot).max() < 0.02
+                np.linalg.norm(current[self.ball, packed.VELOCITY]) >= 0.5
+                or abs(current[self.ball, :3] - spot).max() >= 0.02
             )
 
+        first, again, every, stand = planners
         return execute(
             Truth(self.scene, threads=1),
             state,
-            *planners,
-            window=self.window(target),
+            (
+                Phase(first, again, every, self.window(target), touched),
+                Phase(stand, stand, STAND_EVERY, Standing(self.scene, self.reference).window, links=self.human),
+            ),
             steps=self.reference.strike + 20 + AFTER_CONTACT if steps is None else steps,
-            every=every,
-            keep_planning=untouched,
             key=jax.random.key(seed),
             dt=self.scene.dt,
             observe=observe,
         )
+
+    @staticmethod
+    def plans(execution: Execution) -> list[Replan]:
+        """The plans of the kick itself."""
+        return [replan for replan in execution.replans if replan.phase == 0]
 
     def contact_step(self, states: np.ndarray) -> int | None:
         """The first step after which the ball (T + 1, L, 13) moves, or None."""
@@ -215,12 +243,13 @@ class Kick:
         contact = self.contact_step(states)
         begin = 0 if contact is None else max(contact - 1, 0)
         end = len(states) if contact is None else min(contact + AFTER_CONTACT + 1, len(states))
-        last = execution.replans[-1]
+        plans = self.plans(execution)
+        last = plans[-1]
         links = states[: begin + 1, self.human, packed.POSITION]
         wanted = self.reference.states[: begin + 1, self.human, packed.POSITION]
         apart = np.linalg.norm((links - links[:, :1]) - (wanted - wanted[:, :1]), axis=-1)
         model_error = miss(last.info.states[:, self.ball, packed.POSITION], target)
-        seconds = [replan.info.seconds for replan in execution.replans]
+        seconds = [replan.info.seconds for replan in plans]
         again = 1e3 * np.array(seconds[1:] or seconds)
         return {
             "target": [float(x) for x in target],
@@ -244,30 +273,36 @@ def miss(path: np.ndarray, target: np.ndarray) -> float:
     return nearest_approach(path, target).distance
 
 
-def dynamics_of(scene: Scene, name: DynamicsName, weights: Path) -> tuple[Dynamics, str]:
-    """The planner's model, followed by the ball alone once no link can reach it any more, and what weights it has."""
+def models_of(scene: Scene, name: DynamicsName, weights: Path) -> Models:
+    """The planners' models; that of the scene goes on with the ball alone once no link can reach it any more."""
     human, ball = scene.bodies[0].name, scene.bodies[-1].name
-    alone = scene.only(ball)
-    whole: Dynamics
-    tail: Dynamics
+
+    def model(*bodies: str) -> Dynamics:
+        part = scene.only(*bodies)
+        return MujocoDynamics(Truth(part, ROWS)) if name == "mujoco" else Simulator(part, config, learned)
+
     if name == "larp":
         config, learned, manifest = stored.load(weights, scene)
-        whole, tail = Simulator(scene, config, learned), Simulator(alone, config, learned)
         used = manifest["sha256"][:12]
     elif name == "mujoco":
-        whole, tail = MujocoDynamics(Truth(scene, ROWS)), MujocoDynamics(Truth(alone, ROWS))
         used = "none"
     else:
         raise ValueError(f"dynamics is {name!r}, but must be 'larp' or 'mujoco'")
-    return Continued(whole, tail, slice(scene.rows(human).stop, None), FLIGHT), used
+    rest = slice(scene.rows(human).stop, None)
+    return Models(Continued(model(human, ball), model(ball), rest, FLIGHT), model(human), used)
 
 
-def planners_of(kick: Kick, preset: str, dynamics: Dynamics) -> tuple[Planner, Planner, int]:
-    """The preset's planners for the first plan and for replans, and the steps between replans."""
+def planners_of(kick: Kick, preset: str, models: Models) -> Planners:
+    """The preset's planners."""
     if preset not in PRESETS:
         raise ValueError(f"preset is {preset!r}, but must be one of {', '.join(PRESETS)}")
     chosen = PRESETS[preset]
-    return kick.planner(dynamics, chosen.first), kick.planner(dynamics, chosen.again), chosen.every
+    return Planners(
+        kick.planner(models.whole, chosen.first),
+        kick.planner(models.whole, chosen.again),
+        chosen.every,
+        Standing(kick.scene, kick.reference).planner(models.human, chosen.stand),
+    )
 
 
 def checked_target(target: tuple[float, ...]) -> np.ndarray:
@@ -286,7 +321,7 @@ def remember_compilations() -> None:
 
 def recording_of(kick: Kick, execution: Execution, target: np.ndarray, summary: dict[str, Any]) -> Recording:
     """The kick for the viewer: the truth, the last plan's prediction, the reference."""
-    last = execution.replans[-1]
+    last = kick.plans(execution)[-1]
     states = np.stack(execution.states)
     predicted = np.concatenate([states[last.step : last.step + 1], last.info.states])
     shown = {
@@ -303,7 +338,8 @@ def recording_of(kick: Kick, execution: Execution, target: np.ndarray, summary: 
 def write(folder: Path, kick: Kick, execution: Execution, target: np.ndarray, summary: dict[str, Any]) -> None:
     """`kick.npz`, `kick.png`, `kick.html` and, last, `summary.json`; each whole or not at all."""
     recording = recording_of(kick, execution, target, summary)
-    last = execution.replans[-1]
+    plans = kick.plans(execution)
+    last = plans[-1]
     buffer = io.BytesIO()
     np.savez_compressed(
         buffer,
@@ -314,7 +350,7 @@ def write(folder: Path, kick: Kick, execution: Execution, target: np.ndarray, su
         predicted_states=last.info.states,
     )
     write_whole(folder / "kick.npz", buffer.getvalue())
-    costs = {name: [replan.info.terms[name] for replan in execution.replans] for name in last.info.terms}
+    costs = {name: [replan.info.terms[name] for replan in plans] for name in last.info.terms}
     kick_picture(recording, costs, folder / "kick.png")
     write_html(recording, folder / "kick.html")
     write_whole(folder / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())
@@ -375,20 +411,20 @@ def main(
         raise ValueError(f"preset is {preset!r}, but must be one of {', '.join(PRESETS)}")
     remember_compilations()
     kick = prepare(reference)
-    model, used = dynamics_of(kick.scene, dynamics, weights)  # type: ignore[arg-type]
-    first, again, every = planners_of(kick, preset, model)
+    models = models_of(kick.scene, dynamics, weights)  # type: ignore[arg-type]
+    planners = planners_of(kick, preset, models)
     page = LivePage(port=port) if view else None
     if page:
         page.begin(kick.scene, goal)
 
     def observe(execution: Execution) -> None:
         if page:
-            last, step = execution.replans[-1], len(execution.states) - 1
+            last, step = kick.plans(execution)[-1], len(execution.states) - 1
             news = last.info.states[1:] if last.step == step - 1 else None
             page.update(execution.states[-1], news, step * kick.scene.dt)
 
-    execution = kick.run((first, again), every, goal, seed, observe=observe)
-    summary = kick.report(execution, goal) | {"preset": preset, "dynamics": dynamics, "weights": used, "seed": seed}
+    execution = kick.run(planners, goal, seed, observe=observe)
+    summary = kick.report(execution, goal) | {"preset": preset, "dynamics": dynamics, "weights": models.weights, "seed": seed}
     write(out, kick, execution, goal, summary)
     Console().print(table(summary))
     Console().print(f"{out}/: summary.json, kick.npz, kick.png, kick.html")

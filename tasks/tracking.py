@@ -16,7 +16,7 @@ from larp_model import state as packed
 from larp_model.scene import Scene
 from larp_model.truth.mujoco import Truth
 from mpc import CEM, CostTerm, MujocoDynamics, Planner, quadratic
-from mpc.loop import Window, execute
+from mpc.loop import Phase, Window, execute
 
 HORIZON = 30
 KNOTS = 7
@@ -56,8 +56,11 @@ class Tracker:
             rows = np.minimum(begin + step + np.arange(HORIZON + 1), len(self.wanted) - 1)
             return Window(self.controls[rows[:-1]], (self.wanted[rows[1:]], self.weights[rows[1:]]))
 
+        def lost(current: np.ndarray) -> bool:
+            return not np.isfinite(current).all()
+
         execution = execute(
-            Truth(self.scene), state, self.planner, self.planner, window, end - begin, EVERY,
-            lambda current: bool(np.isfinite(current).all()), jax.random.key(0), self.scene.dt,
+            Truth(self.scene), state, [Phase(self.planner, self.planner, EVERY, window, lost)],
+            end - begin, jax.random.key(0), self.scene.dt,
         )  # fmt: skip
         return np.array(execution.states), np.array(execution.controls)

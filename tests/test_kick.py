@@ -81,10 +81,9 @@ def test_tasks_are_drawn_within_the_protocols_bounds() -> None:
 
 
 def test_with_the_truth_as_model_what_is_predicted_happens(task: kick.Kick, small: None) -> None:
-    model, _ = kick.dynamics_of(task.scene, "mujoco", stored.SHIPPED)
-    first, again, _ = kick.planners_of(task, "fast", model)
+    planners = kick.planners_of(task, "fast", kick.models_of(task.scene, "mujoco", stored.SHIPPED))
     target = np.array([3.0, 0.2, 0.4])
-    execution = task.run((first, again), 100, target, seed=0)
+    execution = task.run(planners._replace(every=100), target, seed=0)
     report = task.report(execution, target)
     assert report["touched"]
     assert report["truth_error_m"] == pytest.approx(report["model_error_m"], abs=0.01)
@@ -102,10 +101,10 @@ def test_a_kick_end_to_end_leaves_all_its_files_and_they_agree(tmp_path: Path, s
 
 
 def test_a_target_out_of_reach_is_marked_and_still_gets_a_plan(task: kick.Kick, small: None) -> None:
-    model, _ = kick.dynamics_of(task.scene, "larp", stored.SHIPPED / f"{kick.WEIGHTS}.json")
-    first, again, every = kick.planners_of(task, "fast", model)
+    models = kick.models_of(task.scene, "larp", stored.SHIPPED / f"{kick.WEIGHTS}.json")
+    planners = kick.planners_of(task, "fast", models)
     target = np.array([0.0, 0.0, 40.0])
-    report = task.report(task.run((first, again), every, target, seed=0), target)
+    report = task.report(task.run(planners, target, seed=0), target)
     assert not report["reachable"]
     assert np.isfinite(report["truth_error_m"])
 

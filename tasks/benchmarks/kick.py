@@ -14,7 +14,7 @@ from rich.table import Table
 from larp_model import weights as stored
 from tasks.benchmarks import report
 from tasks.data import random_task
-from tasks.kick import PRESETS, WEIGHTS, dynamics_of, planners_of, prepare, remember_compilations, run
+from tasks.kick import PRESETS, WEIGHTS, models_of, planners_of, prepare, remember_compilations, run
 
 WITHIN = (0.1, 0.25, 0.5)
 
@@ -90,19 +90,19 @@ def main(
     json = json or Path(f"runs/benchmarks/{name}.json")
     remember_compilations()
     kick = prepare()
-    model, used = dynamics_of(kick.scene, dynamics, weights)  # type: ignore[arg-type]
-    first, again, every = planners_of(kick, preset, model)
+    models = models_of(kick.scene, dynamics, weights)  # type: ignore[arg-type]
+    planners = planners_of(kick, preset, models)
     random = np.random.default_rng(seed)
     rows = []
     for index in track(range(targets), description="kicks", disable=not sys.stderr.isatty()):
         target, shift = random_task(random)
-        execution = kick.run((first, again), every, target, seed + index, shift)
+        execution = kick.run(planners, target, seed + index, shift)
         rows.append(
             kick.report(execution, target)
             | {
                 "preset": preset,
                 "dynamics": dynamics,
-                "weights": used,
+                "weights": models.weights,
                 "seed": seed + index,
                 "ball_shift": shift.tolist(),
             }
