@@ -424,7 +424,12 @@ def main(
             page.update(execution.states[-1], news, step * kick.scene.dt)
 
     execution = kick.run(planners, goal, seed, observe=observe)
-    summary = kick.report(execution, goal) | {"preset": preset, "dynamics": dynamics, "weights": models.weights, "seed": seed}
+    summary = kick.report(execution, goal) | {
+        "preset": preset,
+        "dynamics": dynamics,
+        "weights": models.weights,
+        "seed": seed,
+    }
     write(out, kick, execution, goal, summary)
     Console().print(table(summary))
     Console().print(f"{out}/: summary.json, kick.npz, kick.png, kick.html")

@@ -11,7 +11,6 @@ et al., "Capture Point: A Step toward Humanoid Push Recovery", 2006): where a fo
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp

@@ -29,7 +29,7 @@ from larp_model.truth import episodes as truth_episodes
 from larp_model.truth.episodes import Episodes
 from larp_model.truth.mujoco import SUBSTEPS, Truth
 from tasks.data import WINDOWS, contact_episodes, random_episodes, random_task
-from tasks.kick import WEIGHTS, Kick, dynamics_of, planners_of, prepare, remember_compilations, run
+from tasks.kick import WEIGHTS, Kick, models_of, planners_of, prepare, remember_compilations, run
 
 EVALUATION_SEED = 1
 # Errors of a velocity count linearly: the median launch matters, not the worst.
@@ -67,18 +67,17 @@ def planned_episodes(kick: Kick, weights: Path, tasks: int, elites: int, seed: i
     Returns the episodes, of `HORIZON` steps, and how many diverged.
     """
     random = np.random.default_rng(seed)
-    model, _ = dynamics_of(kick.scene, "larp", weights)
-    first, again, every = planners_of(kick, "balanced", model)
+    planners = planners_of(kick, "balanced", models_of(kick.scene, "larp", weights))
     states, controls = [], []
     for index in range(tasks):
         target, shift = random_task(random)
-        execution = kick.run((first, again), every, target, seed + index, shift, steps=kick.reference.strike + 10)
-        for replan in execution.replans:
+        execution = kick.run(planners, target, seed + index, shift, steps=kick.reference.strike + 10)
+        for replan in kick.plans(execution):
             window = kick.window(target)(replan.step).controls
             count = elites if replan.step else 2 * elites
             for knots in np.asarray(replan.plan.elites[:count]):
                 states.append(execution.states[replan.step])
-                controls.append(first.controls(replan.plan._replace(elites=knots[None]), window))
+                controls.append(planners.first.controls(replan.plan._replace(elites=knots[None]), window))
     return truth_episodes.record(Truth(kick.scene, 128), np.stack(states), np.stack(controls))
 
 

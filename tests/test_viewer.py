@@ -193,9 +193,7 @@ def test_replay_stands_alone(recording: Recording, tmp_path: Path) -> None:
     assert path.stat().st_size < 3_000_000
 
 
-def test_failed_replay_leaves_nothing(
-    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failed_replay_leaves_nothing(recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise OSError("disk full")
 
