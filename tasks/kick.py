@@ -41,6 +41,7 @@ from mpc import CEM, Continued, CostTerm, Dynamics, Gradient, MujocoDynamics, Pl
 from mpc.loop import Execution, Phase, Replan, Window, execute
 from tasks import references
 from tasks.data import stray
+from tasks.gap import contact_step, gap
 from tasks.references import Reference
 from tasks.standing import Standing
 from viewer import LivePage, Recording, kick_picture, nearest_approach, write_html
@@ -232,15 +233,15 @@ class Kick:
         """The plans of the kick itself."""
         return [replan for replan in execution.replans if replan.phase == 0]
 
-    def contact_step(self, states: np.ndarray) -> int | None:
-        """The first step after which the ball (T + 1, L, 13) moves, or None."""
-        moving = np.linalg.norm(states[:, self.ball, packed.VELOCITY], axis=-1) > 0.3
-        return int(moving.argmax()) if moving.any() else None
+    def predicted(self, execution: Execution) -> np.ndarray:
+        """What the last plan of the kick expected (T', L, 13), from the true state in which it was made."""
+        last = self.plans(execution)[-1]
+        return np.concatenate([execution.states[last.step][None], last.info.states])
 
     def report(self, execution: Execution, target: np.ndarray) -> dict[str, Any]:
         """What `summary.json` says of the kick itself; see the README for each entry."""
         states = np.stack(execution.states)
-        contact = self.contact_step(states)
+        contact = contact_step(states)
         begin = 0 if contact is None else max(contact - 1, 0)
         end = len(states) if contact is None else min(contact + AFTER_CONTACT + 1, len(states))
         plans = self.plans(execution)
@@ -265,6 +266,7 @@ class Kick:
             "compile_seconds": float(sum(replan.info.compile_seconds for replan in execution.replans)),
             "candidates_lost": sum(r.info.candidates - r.info.finite for r in execution.replans),
             "truth_rollouts": 0,
+            "gap": gap(self.scene, states, self.predicted(execution), last.step),
         }
 
 
@@ -323,7 +325,7 @@ def recording_of(kick: Kick, execution: Execution, target: np.ndarray, summary: 
     """The kick for the viewer: the truth, the last plan's prediction, the reference."""
     last = kick.plans(execution)[-1]
     states = np.stack(execution.states)
-    predicted = np.concatenate([states[last.step : last.step + 1], last.info.states])
+    predicted = kick.predicted(execution)
     shown = {
         "passed the target at": f"{100 * summary['truth_error_m']:.1f} cm",
         "the model expected": f"{100 * summary['model_error_m']:.1f} cm",

@@ -1,0 +1,93 @@
+"""The gap between a kick as the model predicted it and as it happened: contact, launch, landing, joints."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from larp_model import features
+from larp_model import state as packed
+from larp_model.scene import Scene
+
+# The ball has been struck when it is faster than this [m/s]; its launch is read so many steps later.
+STRUCK, LAUNCH_STEPS = 0.3, 8
+# It flies when it is higher above the ground than this, and has landed when it is lower than that [m].
+FLYING, LANDED = 0.02, 0.005
+
+
+def contact_step(states: np.ndarray) -> int | None:
+    """The first row of states (T, L, 13) in which the last link, the ball, has been struck; None if it never is."""
+    speed = np.linalg.norm(states[:, -1, packed.VELOCITY], axis=-1)
+    return int((speed > STRUCK).argmax()) if (speed > STRUCK).any() else None
+
+
+def events(scene: Scene, states: np.ndarray) -> dict[str, Any]:
+    """What befalls the ball in states (T, L, 13); None for what does not.
+
+    contact_s: when it has been struck, to a step. contact_link: by which link. contact_point_m: where, from the ball's
+    centre (3,). launch_m_s: its velocity (3,) `LAUNCH_STEPS` later. landing_m: where it first comes down (2,).
+    """
+    none = dict.fromkeys(("contact_s", "contact_link", "contact_point_m", "launch_m_s", "landing_m"))
+    contact = contact_step(states)
+    if not contact:
+        return none
+    pair, ball = scene.pairs[0], states[:, -1]
+    radius = scene.links[-1].radius
+    before = jnp.asarray(states[contact - 1 : contact])
+    touch = features.contact_inputs(scene, pair, before, before, features.morphology(scene)[None])
+    nearest = int(np.argmin(np.asarray(touch.gap[0] - touch.near[0])))
+    first, _ = features.pair_rows(scene, pair)
+    launch = ball[min(contact + LAUNCH_STEPS, len(ball) - 1), packed.VELOCITY]
+    height = ball[contact:, 2] - radius
+    flying = height > FLYING
+    down = np.flatnonzero((height < LANDED) & (np.cumsum(flying) > 0))
+    return none | {
+        "contact_s": contact * scene.dt,
+        "contact_link": scene.links[first[nearest]].name,
+        "contact_point_m": _list(-radius * np.asarray(touch.normal[0, nearest])),
+        "launch_m_s": _list(launch),
+        "landing_m": _list(ball[contact + down[0], :2]) if len(down) else None,
+    }
+
+
+def gap(scene: Scene, truth: np.ndarray, model: np.ndarray, start: int) -> dict[str, Any]:
+    """Both sides of every event, and how far apart they are.
+
+    truth: states (T, L, 13). model: predicted states (T', L, 13), the first of them the truth's in row `start`.
+    launch_error: |v - v'| / |v|; launch_angle_deg: between the two; links_m, joints_deg: mean distance of the human's
+    links and mean angle between its joints, at the true contact.
+    """
+    true, expected = events(scene, truth), events(scene, model)
+    if expected["contact_s"] is not None:
+        expected["contact_s"] += start * scene.dt
+    result: dict[str, Any] = {name: {"truth": true[name], "model": expected[name]} for name in true}
+    result |= dict.fromkeys(("launch_error", "launch_angle_deg", "links_m", "joints_deg"))
+    if true["launch_m_s"] and expected["launch_m_s"]:
+        a, b = np.array(true["launch_m_s"]), np.array(expected["launch_m_s"])
+        speed = np.linalg.norm(a)
+        cosine = a @ b / max(speed * np.linalg.norm(b), 1e-9)
+        result["launch_error"] = float(np.linalg.norm(a - b) / speed)
+        result["launch_angle_deg"] = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    contact = contact_step(truth)
+    if contact is not None and 0 <= contact - start < len(model):
+        human = scene.rows(scene.bodies[0].name)
+        a, b = truth[contact, human], model[contact - start, human]
+        result["links_m"] = float(np.linalg.norm(a[:, :3] - b[:, :3], axis=-1).mean())
+        turned = joint_rotations(scene, a).inv() * joint_rotations(scene, b)
+        result["joints_deg"] = float(np.degrees(turned.magnitude()).mean())
+    return result
+
+
+def joint_rotations(scene: Scene, state: np.ndarray) -> Rotation:
+    """The rotation of each of the first body's links in its parent's frame, from the body's state (n, 13)."""
+    turned = Rotation.from_quat(state[:, packed.ORIENTATION], scalar_first=True)
+    joints = scene.bodies[0].joints
+    parents = [joint.parent for joint in joints]
+    return turned[parents].inv() * turned[1 : len(joints) + 1]
+
+
+def _list(values: np.ndarray) -> list[float]:
+    return [float(value) for value in values]
