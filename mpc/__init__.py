@@ -4,7 +4,7 @@ from mpc.cem import CEM
 from mpc.cost import CostTerm, absolute, evaluate, l2, nearest_on_path, quadratic
 from mpc.dynamics import Continued, Dynamics, MujocoDynamics
 from mpc.gradient import Gradient
-from mpc.planner import Plan, PlanInfo, Planner
+from mpc.planner import Plan, PlanInfo, Planner, Verified
 from mpc.spline import interpolate, shift
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "Plan",
     "PlanInfo",
     "Planner",
+    "Verified",
     "absolute",
     "evaluate",
     "interpolate",

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -32,6 +33,17 @@ class Plan(NamedTuple):
         return self.elites[0]
 
 
+@dataclass(frozen=True)
+class Verified:
+    """An optimiser whose candidates are tried in other, truer dynamics than the planner's own."""
+
+    dynamics: Dynamics
+    optimizer: CEM | Gradient
+
+
+Optimizer = CEM | Gradient | Verified
+
+
 class PlanInfo(NamedTuple):
     """What a step found out; for looking, never carried."""
 
@@ -42,6 +54,7 @@ class PlanInfo(NamedTuple):
     elite_costs: np.ndarray  # (M,) of plan.elites; inf where not known
     finite: int  # candidates with a finite cost ...
     candidates: int  # ... of so many
+    verified: int  # of them in other dynamics than the planner's own
     seconds: float  # from arguments to finished results, compilation left out
     compile_seconds: float  # 0 unless this step had to compile
 
@@ -56,7 +69,7 @@ class Planner:
     theta are `knots` offsets from the reference, evenly spaced from the first control to the last, so that
     zero is the reference itself. The optimisers run in the order given, each on what the one before it found:
     `CEM` alone, `Gradient` alone (on random starts around the reference), or CEM and then Gradient on its
-    elites.
+    elites. `Verified` optimisers, if any, come last: the planner's own dynamics propose, truer ones decide.
 
     `spread` (J, 3) [rad] is the standard deviation of a first plan's candidates; 0 locks an axis. A later
     plan starts from the last one's spread, widened towards the first by the share `reheat`. `lower` and
@@ -72,7 +85,7 @@ class Planner:
         knots: int,
         dt: float,
         spread: ArrayLike,
-        optimizers: CEM | Gradient | Sequence[CEM | Gradient],
+        optimizers: Optimizer | Sequence[Optimizer],
         lower: ArrayLike = -np.pi,
         upper: ArrayLike = np.pi,
         interpolation: Interpolation = "cubic",
@@ -81,7 +94,7 @@ class Planner:
         self.dynamics = dynamics
         self.terms = tuple(terms)
         self.horizon = horizon
-        self.optimizers = (optimizers,) if isinstance(optimizers, CEM | Gradient) else tuple(optimizers)
+        self.optimizers = (optimizers,) if isinstance(optimizers, Optimizer) else tuple(optimizers)
         self.interpolation = interpolation
         self.reheat = reheat
         self.scale = np.asarray(spread, np.float32)
@@ -96,9 +109,17 @@ class Planner:
         self._check()
         self.control_times = dt * np.arange(horizon, dtype=np.float32)
         self.knot_times = np.linspace(0, self.control_times[-1], knots, dtype=np.float32)
-        self.elites = max(optimizer.elites for optimizer in self.optimizers)
+        self.elites = max(optimizer.elites for _, optimizer in self._stages)
         self._compiled: dict[Any, Any] = {}
         self._controls = jax.jit(self._controls_of)
+
+    @property
+    def _stages(self) -> list[tuple[Dynamics, CEM | Gradient]]:
+        """Each optimiser and the dynamics in which it tries its candidates."""
+        return [
+            (each.dynamics, each.optimizer) if isinstance(each, Verified) else (self.dynamics, each)
+            for each in self.optimizers
+        ]
 
     def init(self, key: jax.Array, now: float = 0.0) -> Plan:
         """The plan that follows the reference from `now` [s]; its other elites are drawn around it."""
@@ -128,7 +149,9 @@ class Planner:
         begin = time.perf_counter()
         plan, cost, terms, states, costs, elite_costs = jax.block_until_ready(compiled(*arguments))
         seconds = time.perf_counter() - begin
-        costs = [np.asarray(each) for each in costs]
+        tried = [sum(len(each) for each in stage) for stage in costs]
+        verified = [isinstance(each, Verified) for each in self.optimizers]
+        costs = [np.asarray(each) for stage in costs for each in stage]
         return plan, PlanInfo(
             cost=float(cost),
             terms={name: float(value) for name, value in terms.items()},
@@ -137,6 +160,7 @@ class Planner:
             elite_costs=np.asarray(elite_costs),
             finite=sum(int(np.isfinite(each).sum()) for each in costs),
             candidates=sum(len(each) for each in costs),
+            verified=sum(count for count, other in zip(tried, verified, strict=True) if other),
             seconds=seconds,
             compile_seconds=compile_seconds,
         )
@@ -164,23 +188,30 @@ class Planner:
         context: Any,
         weights: dict[str, jax.Array],
         now: jax.Array,
-    ) -> tuple[Plan, jax.Array, dict[str, jax.Array], jax.Array, list[jax.Array], jax.Array]:
+    ) -> tuple[Plan, jax.Array, dict[str, jax.Array], jax.Array, list[list[jax.Array]], jax.Array]:
         """The whole step, traced once: shift, improve, look at the best."""
 
-        def predict(knots: jax.Array) -> tuple[jax.Array, dict[str, jax.Array], jax.Array]:
+        def predict(dynamics: Dynamics, knots: jax.Array) -> tuple[jax.Array, dict[str, jax.Array], jax.Array]:
             controls = jax.vmap(self._controls_of, (0, None))(knots, reference)
-            states = self.dynamics.rollout(jnp.broadcast_to(state, (len(knots), *state.shape)), controls)
+            states = dynamics.rollout(jnp.broadcast_to(state, (len(knots), *state.shape)), controls)
             one = partial(evaluate, self.terms, context=context, weights=weights)
             return *jax.vmap(one)(states, controls), states
 
+        def cost_in(dynamics: Dynamics, knots: jax.Array) -> jax.Array:
+            return predict(dynamics, knots)[0]
+
         key, draw = jax.random.split(plan.key)
-        search, costs = self._shifted(plan, now - plan.start), []
-        for optimizer in self.optimizers:
+        warm = self._shifted(plan, now - plan.start)
+        search, costs, tried_in = warm, [], self.dynamics
+        for dynamics, optimizer in self._stages:
             draw, phase = jax.random.split(draw)
-            search, tried = optimizer.improve(search, phase, lambda knots: predict(knots)[0])
-            costs += tried
+            if dynamics is not tried_in:  # The costs so far are other dynamics'; and they may have lost the last plan.
+                elites = jnp.concatenate([warm.elites[:1], search.elites[:-1]])
+                search, tried_in = search._replace(elites=elites, costs=warm.costs), dynamics
+            search, tried = optimizer.improve(search, phase, partial(cost_in, dynamics))
+            costs.append(tried)
         elites = jnp.where(jnp.isfinite(search.costs)[:, None, None, None], search.elites, search.elites[0])
-        cost, shares, states = jax.tree.map(lambda leaf: leaf[0], predict(elites[:1]))
+        cost, shares, states = jax.tree.map(lambda leaf: leaf[0], predict(self.dynamics, elites[:1]))
         return Plan(elites, search.spread, now, key), cost, shares, states, costs, search.costs
 
     def _shifted(self, plan: Plan, elapsed: jax.Array) -> Search:
@@ -255,10 +286,13 @@ class Planner:
             raise ValueError(f"terms: got {names}, needs at least one, each with its own name")
         if not self.optimizers:
             raise ValueError("optimizers: got none, needs CEM, Gradient or both")
-        least = min((min(each.sizes) for each in self.optimizers if isinstance(each, CEM)), default=None)
-        for each in self.optimizers:
-            if isinstance(each, Gradient) and not self.dynamics.differentiable:
-                model = type(self.dynamics).__name__
+        kinds = [isinstance(each, Verified) for each in self.optimizers]
+        if kinds != sorted(kinds):
+            raise ValueError("optimizers: got a Verified one before another, needs all Verified ones last")
+        least = min((min(each.sizes) for _, each in self._stages if isinstance(each, CEM)), default=None)
+        for dynamics, each in self._stages:
+            if isinstance(each, Gradient) and not dynamics.differentiable:
+                model = type(dynamics).__name__
                 raise ValueError(f"optimizers: got Gradient, needs differentiable dynamics, not {model}")
             if least is not None and each.elites > least:
                 raise ValueError(f"optimizers: got {each.elites} elites, CEM's smallest round has {least}")

@@ -37,8 +37,21 @@ from larp_model.files import write_whole
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from larp_model.truth.mujoco import Truth
-from mpc import CEM, Continued, CostTerm, Dynamics, Gradient, MujocoDynamics, Planner, l2, nearest_on_path, quadratic
+from mpc import (
+    CEM,
+    Continued,
+    CostTerm,
+    Dynamics,
+    Gradient,
+    MujocoDynamics,
+    Planner,
+    Verified,
+    l2,
+    nearest_on_path,
+    quadratic,
+)
 from mpc.loop import Execution, Phase, Replan, Window, execute
+from mpc.planner import Optimizer
 from tasks import references
 from tasks.data import stray
 from tasks.gap import contact_step, gap
@@ -65,12 +78,14 @@ DynamicsName = Literal["larp", "mujoco"]
 class Preset:
     """How much a plan may cost: the optimisers of the first plan and of each replan, and steps between replans.
 
-    stand: optimisers of the plans that keep the human up after the kick.
+    verify: what tries the last candidates of the first plan and of each replan in the truth, if anything does. stand:
+    optimisers of the plans that keep the human up after the kick.
     """
 
     first: tuple[CEM | Gradient, ...]
     again: tuple[CEM | Gradient, ...]
     every: int
+    verify: tuple[CEM, CEM] | None = None
     stand: tuple[CEM | Gradient, ...] = (CEM(samples=64, rounds=2, elites=12, decay=1.0),)
 
 
@@ -79,6 +94,7 @@ class Models(NamedTuple):
 
     whole: Dynamics
     human: Dynamics
+    learned: bool
     weights: str
 
 
@@ -107,6 +123,7 @@ PRESETS = {
         (CEM(samples=512, rounds=12, elites=32, decay=1.0), Gradient(steps=16, elites=32)),
         (CEM(samples=256, rounds=4, elites=32, decay=1.0),),
         every=2,
+        verify=(CEM(samples=32, rounds=4, elites=8, decay=1.0), CEM(samples=32, rounds=1, elites=8, decay=1.0)),
     ),
 }
 
@@ -174,9 +191,9 @@ class Kick:
 
         return at
 
-    def planner(self, dynamics: Dynamics, optimizers: tuple[CEM | Gradient, ...]) -> Planner:
+    def planner(self, dynamics: Dynamics, optimizers: tuple[Optimizer, ...]) -> Planner:
         """A planner of this task; gradient steps are left out where the dynamics have no gradient."""
-        usable = [each for each in optimizers if dynamics.differentiable or isinstance(each, CEM)]
+        usable = [each for each in optimizers if dynamics.differentiable or not isinstance(each, Gradient)]
         return Planner(
             dynamics,
             self.terms,
@@ -265,7 +282,7 @@ class Kick:
             "replan_ms": {"p50": float(np.quantile(again, 0.5)), "p99": float(np.quantile(again, 0.99))},
             "compile_seconds": float(sum(replan.info.compile_seconds for replan in execution.replans)),
             "candidates_lost": sum(r.info.candidates - r.info.finite for r in execution.replans),
-            "truth_rollouts": 0,
+            "truth_rollouts": sum(replan.info.verified for replan in plans),
             "gap": gap(self.scene, states, self.predicted(execution), last.step),
         }
 
@@ -291,7 +308,7 @@ def models_of(scene: Scene, name: DynamicsName, weights: Path) -> Models:
     else:
         raise ValueError(f"dynamics is {name!r}, but must be 'larp' or 'mujoco'")
     rest = slice(scene.rows(human).stop, None)
-    return Models(Continued(model(human, ball), model(ball), rest, FLIGHT), model(human), used)
+    return Models(Continued(model(human, ball), model(ball), rest, FLIGHT), model(human), name == "larp", used)
 
 
 def planners_of(kick: Kick, preset: str, models: Models) -> Planners:
@@ -299,9 +316,17 @@ def planners_of(kick: Kick, preset: str, models: Models) -> Planners:
     if preset not in PRESETS:
         raise ValueError(f"preset is {preset!r}, but must be one of {', '.join(PRESETS)}")
     chosen = PRESETS[preset]
+    first: tuple[Optimizer, ...] = chosen.first
+    again: tuple[Optimizer, ...] = chosen.again
+    if chosen.verify and models.learned:
+        truth = models_of(kick.scene, "mujoco", Path()).whole
+        first, again = (
+            (*proposing, Verified(truth, search))
+            for proposing, search in zip((first, again), chosen.verify, strict=True)
+        )
     return Planners(
-        kick.planner(models.whole, chosen.first),
-        kick.planner(models.whole, chosen.again),
+        kick.planner(models.whole, first),
+        kick.planner(models.whole, again),
         chosen.every,
         Standing(kick.scene, kick.reference).planner(models.human, chosen.stand),
     )
