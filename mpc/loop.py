@@ -29,8 +29,8 @@ class Window(NamedTuple):
     context: Any
 
 
-def never(state: np.ndarray) -> bool:
-    """No state ends the phase."""
+def never(step: int, state: np.ndarray) -> bool:
+    """Nothing ends the phase."""
     return False
 
 
@@ -38,23 +38,24 @@ class Phase(NamedTuple):
     """A part of an execution: who plans in it, and for what.
 
     first: the planner of its first plan; again: of all later ones, every `every` steps. Both share horizon, knots and
-    elites. window: what is wanted from a step on. over: the states (L, 13) in which the next phase begins, or, after
-    the last, planning ends. links: those that the planners' dynamics know.
+    elites. window: what is wanted from a step on. over: whether, in a step with a state (L, 13), the next phase begins
+    or, after the last, planning ends. links: those that the planners' dynamics know.
     """
 
     first: Planner
     again: Planner
     every: int
     window: Callable[[int], Window]
-    over: Callable[[np.ndarray], bool] = never
+    over: Callable[[int, np.ndarray], bool] = never
     links: slice = slice(None)
 
 
 class Replan(NamedTuple):
-    """One planning step: when it was made, in which phase, the plan and what was found."""
+    """One planning step: when it was made, in which phase, the state (L, 13) it saw, the plan and what was found."""
 
     step: int
     phase: int
+    state: np.ndarray
     plan: Plan
     info: PlanInfo
 
@@ -76,18 +77,19 @@ def execute(
     key: jax.Array,
     dt: float,
     observe: Callable[[Execution], None] = lambda execution: None,
+    sense: Callable[[np.ndarray], np.ndarray] = lambda state: state,
 ) -> Execution:
     """Plan in the true state, from state (L, 13) on, execute and plan again, one phase after the other.
 
     After the last phase its plan is carried out, and after the plan's end the task's reference. `observe` is called
-    after every step.
+    after every step. sense: what the planners are shown of a true state (L, 13); all of it by default.
     """
     world.reset(state[None])
     execution = Execution([np.asarray(state)])
     index, plan, planned_at, targets = 0, None, 0, np.zeros(0)
     for step in range(steps):
-        current = execution.states[-1]
-        while index < len(phases) and phases[index].over(current):
+        current = sense(execution.states[-1])
+        while index < len(phases) and phases[index].over(step, current):
             index, plan = index + 1, None
         phase = phases[min(index, len(phases) - 1)]
         if index < len(phases) and (plan is None or step - planned_at >= phase.every):
@@ -96,7 +98,7 @@ def execute(
             wanted = phase.window(step)
             plan, info = planner.step(before, current[phase.links], wanted.controls, wanted.context, now=step * dt)
             targets, planned_at = np.asarray(planner.controls(plan, wanted.controls)), step
-            execution.replans.append(Replan(step, index, plan, info))
+            execution.replans.append(Replan(step, index, current, plan, info))
         ahead = step - planned_at
         control = targets[ahead] if ahead < len(targets) else phase.window(step).controls[0]
         execution.controls.append(control)

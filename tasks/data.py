@@ -168,6 +168,12 @@ def contact_episodes(
     return record(Truth(scene, batch=256), states[apart], controls[apart], torques[apart])
 
 
+def random_roll(random: np.random.Generator, fastest: float) -> np.ndarray:
+    """A velocity (2,) [m/s], up to `fastest`, of a ball that comes from ahead or from the kicking side."""
+    bearing = np.radians(random.uniform(-90.0, 30.0))
+    return -random.uniform(0.0, fastest) * np.array([np.cos(bearing), np.sin(bearing)])
+
+
 def random_task(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """A target (3,) [m] and a shift of the ball (2,) [m], as `tasks.benchmarks.kick` draws them."""
     bearing = np.radians(random.uniform(-BEARING, BEARING))

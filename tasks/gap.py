@@ -18,20 +18,27 @@ STRUCK, LAUNCH_STEPS = 0.3, 8
 FLYING, LANDED = 0.02, 0.005
 
 
-def contact_step(states: np.ndarray) -> int | None:
-    """The first row of states (T, L, 13) in which the last link, the ball, has been struck; None if it never is."""
-    speed = np.linalg.norm(states[:, -1, packed.VELOCITY], axis=-1)
-    return int((speed > STRUCK).argmax()) if (speed > STRUCK).any() else None
+def contact_step(states: np.ndarray, untouched: np.ndarray | None = None) -> int | None:
+    """The first row of states (T, L, 13) in which the last link, the ball, has been struck; None if it never is.
+
+    untouched: the velocities (T', 3) [m/s] that it would have if nothing touched it; at rest by default.
+    """
+    velocity = states[:, -1, packed.VELOCITY]
+    if untouched is not None:
+        rows = np.minimum(np.arange(len(velocity)), len(untouched) - 1)
+        velocity = velocity - untouched[rows]
+    struck = np.linalg.norm(velocity, axis=-1) > STRUCK
+    return int(struck.argmax()) if struck.any() else None
 
 
-def events(scene: Scene, states: np.ndarray) -> dict[str, Any]:
-    """What befalls the ball in states (T, L, 13); None for what does not.
+def events(scene: Scene, states: np.ndarray, untouched: np.ndarray | None = None) -> dict[str, Any]:
+    """What befalls the ball in states (T, L, 13); None for what does not. untouched: see `contact_step`.
 
     contact_s: when it has been struck, to a step. contact_link: by which link. contact_point_m: where, from the ball's
     centre (3,). launch_m_s: its velocity (3,) `LAUNCH_STEPS` later. landing_m: where it first comes down (2,).
     """
     none = dict.fromkeys(("contact_s", "contact_link", "contact_point_m", "launch_m_s", "landing_m"))
-    contact = contact_step(states)
+    contact = contact_step(states, untouched)
     if not contact:
         return none
     pair, ball = scene.pairs[0], states[:, -1]
@@ -53,14 +60,17 @@ def events(scene: Scene, states: np.ndarray) -> dict[str, Any]:
     }
 
 
-def gap(scene: Scene, truth: np.ndarray, model: np.ndarray, start: int) -> dict[str, Any]:
+def gap(
+    scene: Scene, truth: np.ndarray, model: np.ndarray, start: int, untouched: np.ndarray | None = None
+) -> dict[str, Any]:
     """Both sides of every event, and how far apart they are.
 
     truth: states (T, L, 13). model: predicted states (T', L, 13), the first of them the truth's in row `start`.
     launch_error: |v - v'| / |v|; launch_angle_deg: between the two; links_m, joints_deg: mean distance of the human's
     links and mean angle between its joints, at the true contact.
     """
-    true, expected = events(scene, truth), events(scene, model)
+    true = events(scene, truth, untouched)
+    expected = events(scene, model, None if untouched is None else untouched[start:])
     if expected["contact_s"] is not None:
         expected["contact_s"] += start * scene.dt
     result: dict[str, Any] = {name: {"truth": true[name], "model": expected[name]} for name in true}
@@ -71,7 +81,7 @@ def gap(scene: Scene, truth: np.ndarray, model: np.ndarray, start: int) -> dict[
         cosine = a @ b / max(speed * np.linalg.norm(b), 1e-9)
         result["launch_error"] = float(np.linalg.norm(a - b) / speed)
         result["launch_angle_deg"] = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-    contact = contact_step(truth)
+    contact = contact_step(truth, untouched)
     if contact is not None and 0 <= contact - start < len(model):
         human = scene.rows(scene.bodies[0].name)
         a, b = truth[contact, human], model[contact - start, human]

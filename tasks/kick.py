@@ -59,8 +59,8 @@ from tasks.references import Reference
 from tasks.standing import Standing
 from viewer import LivePage, Recording, kick_picture, nearest_approach, write_html
 
-HORIZON = 60
-FLIGHT = 110
+# Steps that a plan looks beyond the reference's strike with the whole scene, and then with the ball alone.
+BEYOND, FLIGHT = 15, 120
 # Spread of a first plan, as a share of how far the training data strays from the reference.
 SEARCH = 0.5
 KNOTS = 9
@@ -68,9 +68,12 @@ AFTER_CONTACT = 200
 STAND_EVERY = 4
 REACHABLE = 0.25
 WEIGHTS = "human_ball"
+# Of the human whom the shipped weights know [m, kg].
+HEIGHT, MASS = 1.75, 70.0
 # Rows that MuJoCo, as the planner's model, rolls out side by side.
 ROWS = 32
 
+Pair = np.ndarray | tuple[float, float]
 DynamicsName = Literal["larp", "mujoco"]
 
 
@@ -137,6 +140,7 @@ class Kick:
         self.human = scene.rows(scene.bodies[0].name)
         self.ball = len(scene.links) - 1
         self.foot = scene.index(scene.bodies[0].name, "right_foot")
+        self.horizon = reference.strike + BEYOND
         self.standing = standing_height(scene.bodies[0])
         bounds = np.array([(motor.lower, motor.upper) for motor in scene.motors])
         self.lower, self.upper = bounds[:, 0], bounds[:, 1]
@@ -179,13 +183,15 @@ class Kick:
         """The reference's window from any step on, with the target (3,) [m], as the residuals' context."""
 
         def at(step: int) -> Window:
-            states, controls = self.reference.window(step, HORIZON)
+            states, controls = self.reference.window(step, self.horizon)
             links = states[:, self.human, packed.POSITION]
             context = {
                 "target": np.asarray(target, float),
                 "reference": links - links[:, :1],
                 "controls": controls,
-                "until_strike": (np.arange(step + 1, step + 1 + HORIZON) <= self.reference.strike + 5).astype(float),
+                "until_strike": (np.arange(step + 1, step + 1 + self.horizon) <= self.reference.strike + 5).astype(
+                    float
+                ),
             }
             return Window(controls, context)
 
@@ -197,7 +203,7 @@ class Kick:
         return Planner(
             dynamics,
             self.terms,
-            HORIZON,
+            self.horizon,
             KNOTS,
             self.scene.dt,
             SEARCH * stray(self.scene),
@@ -206,30 +212,46 @@ class Kick:
             self.upper,
         )
 
-    def start(self, ball_offset: np.ndarray | tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
-        """The state (L, 13) before the kick, the ball moved by an offset (2,) [m] along the ground."""
+    def start(self, ball_offset: Pair = (0.0, 0.0), ball_velocity: Pair = (0.0, 0.0)) -> np.ndarray:
+        """The state (L, 13) before the kick, the ball moved by an offset (2,) [m] along the ground.
+
+        ball_velocity: (2,) [m/s], with which it rolls so that it passes that place when the reference strikes.
+        """
         state = self.reference.states[0].copy()
-        state[self.ball, :2] += ball_offset
+        ball = state[self.ball]
+        ball[:2] += ball_offset
+        radius = self.scene.links[self.ball].radius
+        ball[7:9] = ball_velocity
+        ball[10:12] = -ball_velocity[1] / radius, ball_velocity[0] / radius
+        way = self.untouched(state, self.reference.strike)[-1]
+        ball[:2] -= way[:2] - ball[:2]
         return state
+
+    def untouched(self, state: np.ndarray, steps: int) -> np.ndarray:
+        """The ball's states (steps + 1, 13) from a state (L, 13) on, if nothing but the ground touched it."""
+        truth = Truth(self.scene.only(self.scene.bodies[-1].name), threads=1)
+        alone = state[None, self.ball :]
+        after, _ = truth.rollout(alone, np.zeros((1, steps, 0, 3)))
+        return np.concatenate([alone[0], after[0][:, 0]])
 
     def run(
         self,
         planners: Planners,
         target: np.ndarray,
         seed: int,
-        ball_offset: np.ndarray | tuple[float, float] = (0.0, 0.0),
+        state: np.ndarray | None = None,
         steps: int | None = None,
         observe: Callable[[Execution], None] = lambda execution: None,
+        sense: Callable[[np.ndarray], np.ndarray] = lambda state: state,
     ) -> Execution:
-        """Plan and execute one kick in the truth, for `steps` or until 2 s after contact."""
-        state = self.start(ball_offset)
-        spot = state[self.ball, :3]
+        """Plan and execute one kick in the truth from a state of `start`, for `steps` or until 2 s after contact."""
+        state = self.start() if state is None else state
+        steps = self.reference.strike + 20 + AFTER_CONTACT if steps is None else steps
+        free = self.untouched(state, steps)
 
-        def touched(current: np.ndarray) -> bool:
-            return bool(
-                np.linalg.norm(current[self.ball, packed.VELOCITY]) >= 0.5
-                or abs(current[self.ball, :3] - spot).max() >= 0.02
-            )
+        def touched(step: int, current: np.ndarray) -> bool:
+            apart = current[self.ball] - free[step]
+            return bool(np.linalg.norm(apart[packed.VELOCITY]) >= 0.5 or abs(apart[packed.POSITION]).max() >= 0.03)
 
         first, again, every, stand = planners
         return execute(
@@ -239,10 +261,11 @@ class Kick:
                 Phase(first, again, every, self.window(target), touched),
                 Phase(stand, stand, STAND_EVERY, Standing(self.scene, self.reference).window, links=self.human),
             ),
-            steps=self.reference.strike + 20 + AFTER_CONTACT if steps is None else steps,
+            steps,
             key=jax.random.key(seed),
             dt=self.scene.dt,
             observe=observe,
+            sense=sense,
         )
 
     @staticmethod
@@ -251,14 +274,15 @@ class Kick:
         return [replan for replan in execution.replans if replan.phase == 0]
 
     def predicted(self, execution: Execution) -> np.ndarray:
-        """What the last plan of the kick expected (T', L, 13), from the true state in which it was made."""
+        """What the last plan of the kick expected (T', L, 13), from the state it saw on."""
         last = self.plans(execution)[-1]
-        return np.concatenate([execution.states[last.step][None], last.info.states])
+        return np.concatenate([last.state[None], last.info.states])
 
     def report(self, execution: Execution, target: np.ndarray) -> dict[str, Any]:
         """What `summary.json` says of the kick itself; see the README for each entry."""
         states = np.stack(execution.states)
-        contact = contact_step(states)
+        free = self.untouched(states[0], len(states) - 1)[:, packed.VELOCITY]
+        contact = contact_step(states, free)
         begin = 0 if contact is None else max(contact - 1, 0)
         end = len(states) if contact is None else min(contact + AFTER_CONTACT + 1, len(states))
         plans = self.plans(execution)
@@ -283,7 +307,7 @@ class Kick:
             "compile_seconds": float(sum(replan.info.compile_seconds for replan in execution.replans)),
             "candidates_lost": sum(r.info.candidates - r.info.finite for r in execution.replans),
             "truth_rollouts": sum(replan.info.verified for replan in plans),
-            "gap": gap(self.scene, states, self.predicted(execution), last.step),
+            "gap": gap(self.scene, states, self.predicted(execution), last.step, free),
         }
 
 
@@ -292,8 +316,11 @@ def miss(path: np.ndarray, target: np.ndarray) -> float:
     return nearest_approach(path, target).distance
 
 
-def models_of(scene: Scene, name: DynamicsName, weights: Path) -> Models:
-    """The planners' models; that of the scene goes on with the ball alone once no link can reach it any more."""
+def models_of(scene: Scene, name: DynamicsName, weights: Path, trained_on: Scene | None = None) -> Models:
+    """The planners' models; that of the scene goes on with the ball alone once no link can reach it any more.
+
+    trained_on: the scene of the weights, where that is another one.
+    """
     human, ball = scene.bodies[0].name, scene.bodies[-1].name
 
     def model(*bodies: str) -> Dynamics:
@@ -301,7 +328,7 @@ def models_of(scene: Scene, name: DynamicsName, weights: Path) -> Models:
         return MujocoDynamics(Truth(part, ROWS)) if name == "mujoco" else Simulator(part, config, learned)
 
     if name == "larp":
-        config, learned, manifest = stored.load(weights, scene)
+        config, learned, manifest = stored.load(weights, trained_on or scene)
         used = manifest["sha256"][:12]
     elif name == "mujoco":
         used = "none"
@@ -400,9 +427,12 @@ def table(summary: dict[str, Any]) -> Table:
     return rows
 
 
-def prepare(body_reference: Path | None = None) -> Kick:
-    """The kick's scene with its reference: the embedded one, or a captured one from a BVH file."""
-    scene = human_and_ball()
+def prepare(body_reference: Path | None = None, height: float = HEIGHT) -> Kick:
+    """The kick's scene with its reference: the embedded one, or a captured one from a BVH file.
+
+    height: of the human [m].
+    """
+    scene = human_and_ball(height=height, mass=MASS * (height / HEIGHT) ** 2)
     reference = references.embedded(scene) if body_reference is None else references.captured(body_reference, scene)
     return Kick(scene, reference)
 

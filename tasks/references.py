@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from larp_model import bodies
 from larp_model import state as packed
 from larp_model.bodies import standing_height
 from larp_model.scene import Scene
@@ -75,12 +76,13 @@ def standing_on_ground(scene: Scene, targets: np.ndarray, root: Rotation) -> np.
 
 
 def starts(scene: Scene, poses: Sequence[KeyPoses]) -> np.ndarray:
-    """The states (N, L, 13) in which kicks of key poses begin."""
+    """The states (N, L, 13) in which kicks of key poses begin; the ball is as far away as the human is tall."""
     human, ball = scene.bodies[0], scene.bodies[-1]
+    size = standing_height(human) / standing_height(bodies.human())
     first = np.concatenate([each.controls(human, 1, scene.dt) for each in poses])
     states = standing_on_ground(scene, first, Rotation.from_euler("xy", [each.lean for each in poses]))
     states[:, : len(human.links), packed.VELOCITY] = np.array([each.velocity for each in poses])[:, None]
-    states[:, -1, packed.POSITION] = [(*each.ball, ball.links[0].radius) for each in poses]
+    states[:, -1, packed.POSITION] = [(*(size * np.array(each.ball)), ball.links[0].radius) for each in poses]
     return states
 
 

@@ -56,7 +56,7 @@ class Tracker:
             rows = np.minimum(begin + step + np.arange(HORIZON + 1), len(self.wanted) - 1)
             return Window(self.controls[rows[:-1]], (self.wanted[rows[1:]], self.weights[rows[1:]]))
 
-        def lost(current: np.ndarray) -> bool:
+        def lost(step: int, current: np.ndarray) -> bool:
             return not np.isfinite(current).all()
 
         execution = execute(

@@ -64,14 +64,14 @@ STAGES = (
 def planned_episodes(kick: Kick, weights: Path, tasks: int, elites: int, seed: int) -> tuple[Episodes, int]:
     """What the planner tries: of each of its plans on the way to `tasks` kicks some elites, executed in the truth.
 
-    Returns the episodes, of `HORIZON` steps, and how many diverged.
+    Returns the episodes, of the plans' horizon, and how many diverged.
     """
     random = np.random.default_rng(seed)
     planners = planners_of(kick, "balanced", models_of(kick.scene, "larp", weights))
     states, controls = [], []
     for index in range(tasks):
         target, shift = random_task(random)
-        execution = kick.run(planners, target, seed + index, shift, steps=kick.reference.strike + 10)
+        execution = kick.run(planners, target, seed + index, kick.start(shift), steps=kick.reference.strike + 10)
         for replan in kick.plans(execution):
             window = kick.window(target)(replan.step).controls
             count = elites if replan.step else 2 * elites

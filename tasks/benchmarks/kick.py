@@ -12,9 +12,11 @@ from rich.progress import track
 from rich.table import Table
 
 from larp_model import weights as stored
+from larp_model.bodies import human_and_ball
 from tasks.benchmarks import report
-from tasks.data import random_task
-from tasks.kick import PRESETS, WEIGHTS, models_of, planners_of, prepare, remember_compilations, run
+from tasks.data import random_roll, random_task
+from tasks.kick import HEIGHT, PRESETS, WEIGHTS, models_of, planners_of, prepare, remember_compilations, run
+from tasks.sensing import noisy
 
 WITHIN = (0.1, 0.25, 0.5)
 
@@ -71,6 +73,10 @@ def main(
     dynamics: str = "larp",
     json: Path | None = None,
     weights: Path = stored.SHIPPED / f"{WEIGHTS}.json",
+    reference: Path | None = None,
+    height: float = HEIGHT,
+    rolling: float = 0.0,
+    noise: bool = False,
 ) -> None:
     """Plan and execute kicks to random targets.
 
@@ -81,22 +87,38 @@ def main(
         dynamics: the planner's model: larp or mujoco.
         json: where the figures go; the picture goes beside them.
         weights: manifest of the weights of the learned model.
+        reference: a captured kick (BVH) instead of the embedded one.
+        height: of the human [m]; the weights know one of 1.75 m.
+        rolling: greatest speed [m/s] of a ball that comes from ahead or from the kicking side; 0: it rests.
+        noise: show the planner the state with sensing noise.
     """
     if targets < 1:
         raise ValueError(f"targets is {targets}, but must be at least 1")
     if preset not in PRESETS:
         raise ValueError(f"preset is {preset!r}, but must be one of {', '.join(PRESETS)}")
-    name = f"kick_{preset}_{dynamics}"
+    if not (np.isfinite(rolling) and rolling >= 0.0):
+        raise ValueError(f"rolling is {rolling}, but must be a finite speed of at least 0 m/s")
+    variant = {
+        "reference": reference.stem if reference else "",
+        "height": f"{height:g}" if height != HEIGHT else "",
+        "rolling": f"{rolling:g}" if rolling else "",
+        "noise": "on" if noise else "",
+    }
+    said = {option: value for option, value in variant.items() if value}
+    name = "_".join(["kick", preset, dynamics, *(f"{option}_{value}" for option, value in said.items())])
     json = json or Path(f"runs/benchmarks/{name}.json")
     remember_compilations()
-    kick = prepare()
-    models = models_of(kick.scene, dynamics, weights)  # type: ignore[arg-type]
+    kick = prepare(reference, height)
+    trained_on = human_and_ball() if height != HEIGHT else None
+    models = models_of(kick.scene, dynamics, weights, trained_on)  # type: ignore[arg-type]
     planners = planners_of(kick, preset, models)
     random = np.random.default_rng(seed)
     rows = []
     for index in track(range(targets), description="kicks", disable=not sys.stderr.isatty()):
         target, shift = random_task(random)
-        execution = kick.run(planners, target, seed + index, shift)
+        roll = random_roll(random, rolling) if rolling else np.zeros(2)
+        sense = noisy(kick.scene, np.random.default_rng((seed, index))) if noise else lambda state: state
+        execution = kick.run(planners, target, seed + index, kick.start(shift, roll), sense=sense)
         rows.append(
             kick.report(execution, target)
             | {
@@ -105,15 +127,19 @@ def main(
                 "weights": models.weights,
                 "seed": seed + index,
                 "ball_shift": shift.tolist(),
+                "ball_velocity": roll.tolist(),
             }
         )
     figures = summarise(rows)
     command = (
         f"python -m tasks.benchmarks.kick --targets {targets} --seed {seed} --preset {preset} --dynamics {dynamics}"
     )
+    flags = {"reference": f"--reference {reference}", "noise": "--noise"}
+    command = " ".join([command, *(flags.get(option, f"--{option} {value}") for option, value in said.items())])
+    title = ", ".join([f"Kick: {preset}", dynamics, *(f"{option} {value}" for option, value in said.items())])
     report.write_json(json, {"command": command, "hardware": report.hardware(), **figures, "rows": rows})
-    report.write_picture(json.with_suffix(".png"), picture(rows, f"{targets} kicks, {preset}, {dynamics}"))
-    table = Table("measure", "value", title=f"Kick: {preset}, {dynamics}")
+    report.write_picture(json.with_suffix(".png"), picture(rows, title))
+    table = Table("measure", "value", title=title)
     for measure, value in (
         ("mean truth error", f"{figures['mean_truth_error_m']:.3f} m"),
         ("median, 90th percentile", f"{figures['median_truth_error_m']:.3f} m, {figures['p90_truth_error_m']:.3f} m"),
@@ -130,7 +156,7 @@ def main(
     ):
         table.add_row(measure, value)
     report.show(table)
-    report.publish(name, f"Kick: {preset}, {dynamics}, {targets} targets", command, table)
+    report.publish(name, f"{title}, {targets} targets", command, table)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,157 @@
+"""What the model gets wrong about the planner's own candidates: their order, and how the ball leaves.
+
+A planner seeks out the states in which its model is wrong, so that errors on random data say little.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+from rich.progress import track
+from rich.table import Table
+from scipy.stats import spearmanr
+
+from larp_model import evaluation
+from larp_model import weights as stored
+from larp_model.simulator import Simulator
+from larp_model.truth.episodes import Episodes
+from mpc import Dynamics, evaluate
+from mpc.search import coloured_noise
+from tasks.benchmarks import report
+from tasks.data import random_task
+from tasks.kick import WEIGHTS, Kick, Models, models_of, planners_of, prepare, remember_compilations, run
+
+# A candidate is one of the plan's elites, moved by this share of the spread of a first plan.
+AROUND = 0.1
+
+
+def candidates_of(
+    kick: Kick, models: Models, truth: Models, targets: int, candidates: int, seed: int
+) -> tuple[list[dict[str, Any]], Episodes]:
+    """Model cost and truth cost of candidates around each first, middle and last plan; and what truly happened.
+
+    Returns a row for each plan, and the episodes of all candidates.
+    """
+    planners = planners_of(kick, "balanced", models)
+    spread, random = jnp.asarray(planners.first.scale), np.random.default_rng(seed)
+
+    def costs_in(dynamics: Dynamics) -> Callable[..., tuple[jax.Array, jax.Array]]:
+        @jax.jit
+        def costs(state: jax.Array, controls: jax.Array, context: Any) -> tuple[jax.Array, jax.Array]:
+            states = dynamics.rollout(jnp.broadcast_to(state, (len(controls), *state.shape)), controls)
+            total, _ = jax.vmap(partial(evaluate, kick.terms, context=context))(states, controls)
+            return total, states[:, : kick.horizon]
+
+        return costs
+
+    in_model, in_truth = costs_in(models.whole), costs_in(truth.whole)
+    rows, parts = [], []
+    for index in track(range(targets), description="plans", disable=not sys.stderr.isatty()):
+        target, shift = random_task(random)
+        execution = kick.run(planners, target, seed + index, kick.start(shift), steps=kick.reference.strike + 5)
+        plans = kick.plans(execution)
+        for replan in (plans[0], plans[len(plans) // 2], plans[-1]):
+            window = kick.window(target)(replan.step)
+            elites = replan.plan.elites[jnp.arange(candidates) % len(replan.plan.elites)]
+            noise = coloured_noise(jax.random.key(seed + index), elites.shape, 2.0)
+            tried = elites + AROUND * spread * noise
+            controls = jnp.stack(
+                [planners.first.controls(replan.plan._replace(elites=each[None]), window.controls) for each in tried]
+            )
+            context = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), window.context)
+            state = jnp.asarray(replan.state, jnp.float32)
+            believed, _ = in_model(state, controls, context)
+            true, states = in_truth(state, controls, context)
+            sound = np.isfinite(np.asarray(true)) & np.isfinite(np.asarray(believed))
+            rows.append(
+                {
+                    "target": target.tolist(),
+                    "step": replan.step,
+                    "rank_correlation": float(spearmanr(believed[sound], true[sound]).statistic),
+                    "model_cost": np.asarray(believed)[sound].tolist(),
+                    "truth_cost": np.asarray(true)[sound].tolist(),
+                }
+            )
+            whole = np.concatenate([np.broadcast_to(state, (candidates, 1, *state.shape)), states], axis=1)[sound]
+            torques = np.zeros((len(whole), controls.shape[1], len(kick.scene.links), 3), np.float32)
+            parts.append(Episodes(whole, np.asarray(controls)[sound], torques))
+    return rows, Episodes(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def picture(rows: list[dict[str, Any]]) -> Figure:
+    """Model cost against truth cost of all candidates, by how far off the strike was."""
+    figure = Figure(figsize=(7, 6), layout="constrained")
+    axes = figure.subplots()
+    steps = np.array([row["step"] for row in rows])
+    for which, name, colour in zip(range(3), ("first plan", "half-way", "last plan"), MARKS, strict=True):
+        chosen = [row for index, row in enumerate(rows) if index % 3 == which]
+        believed = np.concatenate([row["model_cost"] for row in chosen])
+        true = np.concatenate([row["truth_cost"] for row in chosen])
+        axes.scatter(
+            believed, true, s=6, alpha=0.4, color=colour, label=f"{name}, step {int(np.median(steps[which::3]))}"
+        )
+    low, high = axes.get_xlim()[0], max(axes.get_xlim()[1], axes.get_ylim()[1])
+    axes.plot([max(low, 1e-2), high], [max(low, 1e-2), high], color="0.6", lw=1)
+    axes.set(xscale="log", yscale="log", xlabel="cost in the model", ylabel="cost in MuJoCo")
+    axes.legend(frameon=False)
+    return figure
+
+
+MARKS = ("#0072b2", "#e69f00", "#d55e00")
+
+
+def main(
+    targets: int = 16,
+    candidates: int = 64,
+    seed: int = 0,
+    json: Path = Path("runs/benchmarks/gap.json"),
+    weights: Path = stored.SHIPPED / f"{WEIGHTS}.json",
+) -> None:
+    """Compare model and truth on the planner's own candidates.
+
+    Args:
+        targets: how many kicks are planned.
+        candidates: of each plan.
+        seed: of targets, ball spots and planner.
+        json: where the figures go; the picture goes beside them.
+        weights: manifest of the weights of the learned model.
+    """
+    for name, value in (("targets", targets), ("candidates", candidates)):
+        if value < 1:
+            raise ValueError(f"{name} is {value}, but must be at least 1")
+    remember_compilations()
+    kick = prepare()
+    models, truth = models_of(kick.scene, "larp", weights), models_of(kick.scene, "mujoco", weights)
+    rows, episodes = candidates_of(kick, models, truth, targets, candidates, seed)
+    config, learned, _ = stored.load(weights, kick.scene)
+    simulator = Simulator(kick.scene, config, learned)
+    launch = {str(before): evaluation.launch(simulator, episodes, before) for before in (0, 3)}
+    ranks = {
+        name: float(np.median([row["rank_correlation"] for row in rows[which::3]]))
+        for which, name in enumerate(("first", "middle", "last"))
+    }
+    command = f"python -m tasks.benchmarks.gap --targets {targets} --candidates {candidates} --seed {seed}"
+    content = {"command": command, "hardware": report.hardware(), "rank_correlation": ranks, "launch": launch}
+    report.write_json(json, content | {"rows": rows})
+    report.write_picture(json.with_suffix(".png"), picture(rows))
+    table = Table("measure", "value", title="Gap on the planner's own candidates")
+    for plan, rank in ranks.items():
+        table.add_row(f"rank correlation of costs, {plan} plan", f"{rank:.2f}")
+    for before, found in launch.items():
+        for measure, unit, scale in (("relative_error", " %", 100.0), ("angle_deg", " deg", 1.0)):
+            values = ", ".join(f"{q} {scale * found[measure][q]:.1f}{unit}" for q in ("median", "p75", "p90"))
+            table.add_row(f"launch from {before} steps before contact, {measure}, {found['count']} balls", values)
+    report.show(table)
+    report.publish("gap", f"Gap on the planner's own candidates, {targets} kicks", command, table)
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,38 @@
+"""Sensing noise between the truth and the planner."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from larp_model import state as packed
+from larp_model.scene import Scene
+from larp_model.truth.mujoco import Truth
+
+# Standard deviations: the ball's place [m], joint angles about each axis [degrees], velocities as shares of themselves.
+BALL, JOINTS, VELOCITIES = 0.005, 0.5, 0.02
+
+
+def noisy(scene: Scene, random: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
+    """What sensors tell of a true state (L, 13): its joints hold, and the first body's root is where it is."""
+    truth = Truth(scene, threads=1)
+    body, human = scene.bodies[0], scene.rows(scene.bodies[0].name)
+
+    def sense(state: np.ndarray) -> np.ndarray:
+        seen = state.copy()
+        for columns in (packed.VELOCITY, packed.ANGULAR_VELOCITY):
+            seen[:, columns] *= 1.0 + VELOCITIES * random.standard_normal((len(state), 3))
+        true = Rotation.from_quat(state[human, packed.ORIENTATION], scalar_first=True)
+        turned = [true[0]]
+        for child, joint in enumerate(body.joints, start=1):
+            error = Rotation.from_rotvec(np.radians(JOINTS) * random.standard_normal(3))
+            turned.append(turned[joint.parent] * true[joint.parent].inv() * true[child] * error)
+        seen[human, packed.ORIENTATION] = [each.as_quat(scalar_first=True) for each in turned]
+        truth.reset(seen[None])
+        seen = truth.state()[0]
+        seen[-1, packed.POSITION] += BALL * random.standard_normal(3)
+        return seen
+
+    return sense
