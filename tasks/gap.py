@@ -91,6 +91,25 @@ def gap(
     return result
 
 
+def told(found: dict[str, Any]) -> dict[str, str]:
+    """The gap for a person, a few words a line."""
+    lines = {}
+    if (contact := found["contact_s"])["truth"] is not None:
+        lines["contact"] = (
+            "{truth:.2f} s (model {model:.2f} s)".format(**contact) if contact["model"] else "not expected"
+        )
+    if found["launch_error"] is not None:
+        speeds = {side: float(np.linalg.norm(velocity)) for side, velocity in found["launch_m_s"].items()}
+        apart = f"{found['launch_angle_deg']:.1f}\N{DEGREE SIGN} apart"
+        lines["launch"] = "{truth:.1f} m/s (model {model:.1f} m/s, ".format(**speeds) + apart + ")"
+    if all(found["landing_m"].values()):
+        ways = {side: float(np.hypot(*place)) for side, place in found["landing_m"].items()}
+        lines["lands at"] = "{truth:.1f} m (model {model:.1f} m)".format(**ways)
+    if found["links_m"] is not None:
+        lines["body at contact"] = f"{1000.0 * found['links_m']:.1f} mm, {found['joints_deg']:.1f}\N{DEGREE SIGN} off"
+    return lines
+
+
 def joint_rotations(scene: Scene, state: np.ndarray) -> Rotation:
     """The rotation of each of the first body's links in its parent's frame, from the body's state (n, 13)."""
     turned = Rotation.from_quat(state[:, packed.ORIENTATION], scalar_first=True)

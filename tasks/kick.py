@@ -54,7 +54,7 @@ from mpc.loop import Execution, Phase, Replan, Window, execute
 from mpc.planner import Optimizer
 from tasks import references
 from tasks.data import stray
-from tasks.gap import contact_step, gap
+from tasks.gap import contact_step, gap, told
 from tasks.references import Reference
 from tasks.standing import Standing
 from viewer import LivePage, Recording, kick_picture, nearest_approach, write_html
@@ -379,10 +379,10 @@ def recording_of(kick: Kick, execution: Execution, target: np.ndarray, summary: 
     states = np.stack(execution.states)
     predicted = kick.predicted(execution)
     shown = {
-        "passed the target at": f"{100 * summary['truth_error_m']:.1f} cm",
         "the model expected": f"{100 * summary['model_error_m']:.1f} cm",
         "ball speed": f"{summary['ball_speed_m_s']:.1f} m/s",
         "dynamics": f"{summary['dynamics']}, {summary['preset']}",
+        **told(summary["gap"]),
     }
     title = "Kick to ({:.2f}, {:.2f}, {:.2f}) m".format(*target)
     reference = kick.reference.states[: len(states)]

@@ -27,6 +27,7 @@ TILE = 2.1  # m of the strip for each frame
 # Seconds from contact to each frame but the first.
 FRAMES = {"backswing": -0.14, "contact": 0.0, "launch": 0.04, "follow-through": 0.25, "recovery": 0.7}
 STRUCK = 0.5  # m/s, speed from which the traced link counts as struck
+FACTS = 4  # in a line below the title
 DECADES = 6  # how far the axis of costs reaches below the greatest
 # After Okabe and Ito, safe for all eyes.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -41,8 +42,9 @@ def kick_picture(recording: Recording, costs: Mapping[str, Sequence[float]] | No
     miss = nearest_approach(recording.path, recording.target).distance
     facts = {"nearest to the target": f"{100.0 * miss:.1f} cm", **recording.summary}
     figure.text(0.02, 0.955, recording.title or "Kick", fontsize=20, fontweight="bold")
-    line = "     ".join(f"{name}  {text}" for name, text in facts.items())
-    figure.text(0.02, 0.92, line, fontsize=12, color=QUIET)
+    said = [f"{name}  {text}" for name, text in facts.items()]
+    for line, begin in enumerate(range(0, len(said), FACTS)):
+        figure.text(0.02, 0.925 - 0.025 * line, "     ".join(said[begin : begin + FACTS]), fontsize=12, color=QUIET)
     _strip(figure.add_axes((0.02, 0.56, 0.96, 0.35)), recording)
     width = 0.56 if terms else 0.92
     _paths(figure.add_axes((0.05, 0.31, width, 0.2)), figure.add_axes((0.05, 0.06, width, 0.2)), recording)

@@ -1,0 +1,106 @@
+"""Staying up, sensing, rolling balls, and the report of what differs between prediction and truth."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from larp_model import features
+from larp_model import state as packed
+from mpc import evaluate
+from tasks import kick, sensing
+from tasks.data import random_roll
+from tasks.gap import contact_step, events, gap
+from tasks.standing import Standing
+
+
+@pytest.fixture(scope="module")
+def task() -> kick.Kick:
+    return kick.prepare()
+
+
+def test_standing_costs_nothing_on_the_reference_itself_and_leaning_costs(task: kick.Kick) -> None:
+    standing = Standing(task.scene, task.reference)
+    window = standing.window(40)
+    states, controls = task.reference.window(40, len(window.controls))
+    human = jnp.asarray(states[:, task.human])
+    total, _ = evaluate(standing.terms, human, jnp.asarray(controls), window.context)
+    assert float(total) == pytest.approx(0.0, abs=1e-9)
+    pushed = human.at[..., 7].add(0.5)
+    assert evaluate(standing.terms, pushed, jnp.asarray(controls), window.context)[1]["balance"] > 0.1
+    sunk = human.at[..., 2].add(-0.2)
+    assert evaluate(standing.terms, sunk, jnp.asarray(controls), window.context)[1]["upright"] > 0.1
+
+
+def test_the_capture_point_at_rest_is_below_the_centre_of_mass_and_moves_ahead_with_speed(task: kick.Kick) -> None:
+    standing = Standing(task.scene, task.reference)
+    human = jnp.asarray(task.reference.states[0, task.human]).at[:, packed.VELOCITY].set(0.0)
+    mass = np.array([link.mass for link in task.scene.bodies[0].links])
+    centre = mass @ np.asarray(human[:, packed.POSITION]) / mass.sum()
+    foot = np.asarray(human[standing.foot, :2])
+    np.testing.assert_allclose(standing.capture_point(human), centre[:2] - foot, atol=1e-6)
+    moving = human.at[:, 7].set(1.0)
+    ahead = standing.capture_point(moving) - standing.capture_point(human)
+    np.testing.assert_allclose(ahead, [np.sqrt(centre[2] / task.scene.gravity), 0.0], rtol=1e-5, atol=1e-6)
+
+
+def test_a_kick_that_happens_as_predicted_has_no_gap(task: kick.Kick) -> None:
+    states = task.reference.states[:160]
+    found = gap(task.scene, states, states[20:], 20)
+    assert found["launch_error"] == 0.0 and found["links_m"] == 0.0
+    assert found["launch_angle_deg"] == pytest.approx(0.0, abs=0.01)
+    assert found["joints_deg"] == pytest.approx(0.0, abs=1e-4)
+    for name in ("contact_s", "contact_link", "contact_point_m", "launch_m_s", "landing_m"):
+        assert found[name]["truth"] == found[name]["model"] is not None
+    assert found["contact_link"]["truth"] == "right_foot"
+    assert found["contact_s"]["truth"] == pytest.approx(task.reference.strike * task.scene.dt)
+    assert np.linalg.norm(found["contact_point_m"]["truth"]) == pytest.approx(0.11, abs=1e-4)
+
+
+def test_a_prediction_that_turns_the_ball_is_reported_with_its_angle(task: kick.Kick) -> None:
+    states = task.reference.states[:160]
+    turned = states[20:].copy()
+    velocity = turned[:, task.ball, packed.VELOCITY]
+    turned[:, task.ball, packed.VELOCITY] = Rotation.from_euler("z", 10.0, degrees=True).apply(1.1 * velocity)
+    found = gap(task.scene, states, turned, 20)
+    assert 5.0 < found["launch_angle_deg"] <= 10.0
+    assert found["launch_error"] > 0.1
+
+
+def test_a_ball_that_nothing_touches_has_no_events(task: kick.Kick) -> None:
+    states = np.repeat(task.reference.states[:1], 20, axis=0)
+    assert contact_step(states) is None
+    assert set(events(task.scene, states).values()) == {None}
+
+
+def test_a_rolling_ball_is_where_it_would_rest_when_the_reference_strikes(task: kick.Kick) -> None:
+    random = np.random.default_rng(3)
+    for _ in range(3):
+        roll = random_roll(random, 2.0)
+        state = task.start((0.01, -0.02), roll)
+        np.testing.assert_allclose(state[task.ball, 7:9], roll)
+        path = task.untouched(state, task.reference.strike)
+        wanted = task.reference.ball_spot[:2] + np.array([0.01, -0.02])
+        np.testing.assert_allclose(path[-1, :2], wanted, atol=0.005)
+        assert contact_step(path[:, None], path[:, packed.VELOCITY]) is None
+
+
+def test_sensing_keeps_joints_closed_and_has_the_noise_it_says(task: kick.Kick) -> None:
+    sense = sensing.noisy(task.scene, np.random.default_rng(0))
+    state = task.reference.states[25].astype(float)
+    seen = np.stack([sense(state) for _ in range(200)])
+    shape = features.morphology(task.scene)[None]
+    apart = features.displacement(task.scene, jnp.asarray(seen), shape)
+    assert float(jnp.abs(apart).max()) < 1e-5
+    assert np.std(seen[:, task.ball, :3] - state[task.ball, :3]) == pytest.approx(sensing.BALL, rel=0.15)
+    np.testing.assert_allclose(seen[:, 0, :7], np.broadcast_to(state[0, :7], (200, 7)), atol=1e-6)
+    child, joint, _ = task.scene.bodies[0].motors[-1]
+    true, noisy = (
+        Rotation.from_quat(each[..., joint.parent, 3:7], scalar_first=True).inv()
+        * Rotation.from_quat(each[..., child, 3:7], scalar_first=True)
+        for each in (state, seen)
+    )
+    error = np.degrees((true.inv() * noisy).as_rotvec())
+    assert error.std() == pytest.approx(sensing.JOINTS, rel=0.15)

@@ -1,0 +1,126 @@
+"""Promises of the closed loop: phases, what the planners are shown, and candidates tried in truer dynamics."""
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mpc import CEM, CostTerm, Gradient, Planner, Verified
+from mpc.loop import Phase, Window, execute
+
+HORIZON, DT = 6, 0.01
+
+
+@dataclass(frozen=True)
+class Mover:
+    """Every link moves with the velocity `pace` times the control."""
+
+    pace: float = 100.0
+    differentiable = True
+
+    def rollout(self, state: jax.Array, controls: jax.Array) -> jax.Array:
+        way = jnp.cumsum(self.pace * DT * controls[:, :, 0], axis=1)
+        states = jnp.repeat(state[:, None], controls.shape[1], axis=1)
+        return states.at[..., :3].add(way[:, :, None])
+
+
+@dataclass
+class World:
+    """The truth of `Mover`, one step at a time; it remembers the joint targets it was given."""
+
+    states: np.ndarray = field(default_factory=lambda: np.zeros((1, 2, 13)))
+    given: list[np.ndarray] = field(default_factory=list)
+
+    def reset(self, states: np.ndarray) -> None:
+        self.states = np.array(states)
+
+    def step(self, control: np.ndarray) -> np.ndarray:
+        self.given.append(control[0])
+        self.states = self.states.copy()
+        self.states[..., :3] += control
+        return self.states
+
+
+TERMS = (CostTerm("miss", lambda states, controls, target: states[-1, 0, :3] - target),)
+SEARCH = CEM(samples=24, rounds=3, elites=6)
+START = np.tile(np.eye(1, 13, 3), (2, 1))
+TARGET = np.array([0.5, -0.2, 0.1])
+
+
+def _planner(dynamics: Mover | None = None, optimizers: object = SEARCH) -> Planner:
+    return Planner(dynamics or Mover(), TERMS, HORIZON, 3, DT, np.full((1, 3), 0.1), optimizers)  # type: ignore[arg-type]
+
+
+def _window(step: int) -> Window:
+    return Window(np.zeros((HORIZON, 1, 3)), TARGET)
+
+
+def test_each_phase_plans_with_its_own_planners_for_its_own_links_until_it_is_over() -> None:
+    one, other = _planner(), _planner()
+    phases = (
+        Phase(one, one, 2, _window, lambda step, state: step == 5),
+        Phase(other, other, 3, _window, lambda step, state: step == 12, slice(0, 1)),
+    )
+    world = World()
+    execution = execute(world, START, phases, 20, jax.random.key(0), DT)
+    assert [(replan.step, replan.phase) for replan in execution.replans] == [
+        (0, 0), (2, 0), (4, 0), (5, 1), (8, 1), (11, 1),
+    ]  # fmt: skip
+    assert [replan.info.states.shape[1] for replan in execution.replans] == [2, 2, 2, 1, 1, 1]
+    assert len(execution.states) == 21 and len(world.given) == 20
+    # The last plan is carried out, and then the reference.
+    assert np.abs(world.given[11:16]).max() > 0.0
+    np.testing.assert_array_equal(world.given[11 + HORIZON :], np.zeros((20 - 11 - HORIZON, 1, 3)))
+
+
+def test_planners_see_what_is_sensed_and_the_truth_goes_on_from_the_truth() -> None:
+    planner = _planner()
+    shift = np.zeros((2, 13))
+    shift[:, 0] = 0.25
+    execution = execute(
+        World(),
+        START,
+        (Phase(planner, planner, 3, _window),),
+        6,
+        jax.random.key(0),
+        DT,
+        sense=lambda state: state + shift,
+    )
+    for replan in execution.replans:
+        np.testing.assert_allclose(replan.state, execution.states[replan.step] + shift)
+    # The planner believes itself nearer to the target than it is, and so ends up short of it.
+    assert execution.states[-1][0, 0] < 0.45 * TARGET[0] + 0.1
+
+
+def test_truer_dynamics_decide_and_their_rollouts_are_counted() -> None:
+    model, truth = Mover(60.0), Mover(100.0)
+    believing = _planner(model)
+    checking = _planner(model, (SEARCH, Verified(truth, CEM(samples=48, rounds=4, elites=6))))
+    missed, verified = [], []
+    for planner in (believing, checking):
+        plan, info = planner.step(planner.init(jax.random.key(1)), START, np.zeros((HORIZON, 1, 3)), TARGET)
+        controls = planner.controls(plan, np.zeros((HORIZON, 1, 3)))
+        end = truth.rollout(jnp.asarray(START)[None], controls[None])[0, -1, 0, :3]
+        missed.append(float(np.linalg.norm(end - TARGET)))
+        verified.append(info.verified)
+    assert verified == [0, sum(CEM(samples=48, rounds=4, elites=6).sizes)]
+    assert missed[1] < 0.5 * missed[0]
+
+
+def test_the_last_plan_is_tried_again_in_the_truer_dynamics() -> None:
+    model, truth = Mover(20.0), Mover(100.0)
+    planner = _planner(model, (SEARCH, Verified(truth, CEM(samples=12, rounds=1, elites=6))))
+    plan, info = planner.step(planner.init(jax.random.key(1)), START, np.zeros((HORIZON, 1, 3)), TARGET)
+    costs = [float(info.elite_costs[0])]
+    for _ in range(4):
+        plan, info = planner.step(plan, START, np.zeros((HORIZON, 1, 3)), TARGET)
+        costs.append(float(info.elite_costs[0]))
+    assert all(after <= before + 1e-6 for before, after in pairwise(costs))
+
+
+def test_what_is_verified_comes_last() -> None:
+    with pytest.raises(ValueError, match="optimizers"):
+        _planner(Mover(), (Verified(Mover(50.0), SEARCH), Gradient(steps=1, elites=2)))
