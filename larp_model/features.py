@@ -91,43 +91,89 @@ def _flat(*parts: Array) -> Array:
     return jnp.concatenate([part.reshape(part.shape[0], -1) for part in parts], axis=-1)
 
 
+def servo_torques(body: Body, state: Array, control: Array) -> Array:
+    """The torques (B, j, 3) [N m], world frame, with which a body's servos pull their links towards their targets.
+
+    state (B, n, 13), control (B, j, 3) rotation vectors [rad]. stiffness x (target - joint angle), within the motors'
+    limits; their damping is left out, for it is linear in the angular velocities.
+    """
+    children = np.array([child for child, _, _ in body.motors])
+    parents = np.array([joint.parent for _, joint, _ in body.motors])
+    stiffness = np.array([motor.stiffness for _, _, motor in body.motors], np.float32)[:, None]
+    limit = np.array([motor.torque_limit for _, _, motor in body.motors], np.float32)[:, None]
+    turned = packed.orientation(state)
+    relative = rotation.multiply(rotation.conjugate(turned[:, parents]), turned[:, children])
+    pull = jnp.clip(stiffness * (control - rotation.to_rotation_vector(relative)), -limit, limit)
+    return _apply(rotation.matrix(turned[:, children]), pull)
+
+
+def ends_on_ground(body: Body, state: Array, shape: Array, dt: float) -> tuple[Array, Array]:
+    """How the two ends of every link are to the ground: velocities (B, 2 n, 3) where near it, and scalars (B, 6 n).
+
+    The scalars are clearance [m], nearness (1 on the ground, falling off over 3 cm), and depth [m] after `dt`.
+    """
+    axes = np.array([link.axis for link in body.links], np.float32)
+    half = _apply(rotation.matrix(packed.orientation(state)), 0.5 * shape[..., 0:1] * axes)
+    arms = jnp.concatenate([half, -half], axis=-2)
+    place, velocity, spin, radius = (
+        jnp.concatenate([part, part], axis=-2)
+        for part in (packed.position(state), packed.velocity(state), packed.angular_velocity(state), shape[..., 1:2])
+    )
+    velocity = velocity + jnp.cross(spin, arms)
+    clearance = (place + arms)[..., 2] - radius[..., 0]
+    near = jnp.exp(-jnp.maximum(clearance, 0.0) / 0.03)
+    deep = jnp.minimum(clearance + dt * velocity[..., 2], 0.0)
+    return near[..., None] * velocity, jnp.concatenate([jnp.minimum(clearance, 0.1), near, deep], axis=-1)
+
+
 def body_inputs(
-    body: Body, turn: Array, state: Array, control: Array, torque: Array, apart: Array, pooled: Array, shape: Array
-) -> Array:
+    body: Body, turn: Array, state: Array, control: Array, torque: Array, apart: Array, shape: Array, aided: bool,
+    dt: float,
+) -> Array:  # fmt: skip
     """Inputs (B, F) of the dynamics network, in the frame turned by `turn` (B, 2) about z.
 
-    state (B, n, 13), control (B, j, 3), torque (B, n, 3), joint displacement `apart` (B, n - 1, 3), pooled contact
-    features (B, n, 6), shape (B or 1, n, 3) of the body's n links. As the paper lists them: root-relative position,
-    height, rotation matrix, velocities, length, radius, displacement, target quaternion, torque, contact feature.
+    state (B, n, 13), control (B, j, 3), torque (B, n, 3), joint displacement `apart` (B, n - 1, 3), shape (B or 1, n,
+    3) of the body's n links. As the paper lists them, contacts apart: root-relative position, height, rotation matrix,
+    velocities, length, radius, displacement, target quaternion, torque. aided: `servo_torques` and `ends_on_ground`
+    besides.
     """
     size, links = state.shape[0], len(body.links)
     position = packed.position(state)
     columns = jnp.moveaxis(rotation.matrix(packed.orientation(state)), -1, -2)
-    vectors = jnp.concatenate(
-        [
-            position - position[:, :1],
-            columns.reshape(size, 3 * links, 3),
-            packed.velocity(state),
-            packed.angular_velocity(state),
-            apart,
-            torque,
-            pooled[..., :3] / IMPULSE_SCALE[0],
-            pooled[..., 3:] / IMPULSE_SCALE[1],
-        ],
-        axis=1,
+    vectors = [
+        position - position[:, :1],
+        columns.reshape(size, 3 * links, 3),
+        packed.velocity(state),
+        packed.angular_velocity(state),
+        apart,
+        torque,
+    ]
+    scalars = [
+        position[..., 2],
+        rotation.from_rotation_vector(control),
+        jnp.broadcast_to(shape[..., :2], (size, links, 2)),
+    ]
+    if aided:
+        velocities, ends = ends_on_ground(body, state, shape, dt)
+        vectors += [velocities, *([servo_torques(body, state, control)] if body.motors else [])]
+        scalars.append(ends)
+    turned = rotation.about_z(jnp.concatenate(vectors, axis=1), rotation.opposite(turn)[:, None])
+    return _flat(turned, *scalars)
+
+
+def with_pooled(inputs: Array, turn: Array, pooled: Array) -> Array:
+    """Inputs (B, F + 6 n) of a network that also sees the pooled contact features (B, n, 6) of its n links."""
+    parts = [pooled[..., :3] / IMPULSE_SCALE[0], pooled[..., 3:] / IMPULSE_SCALE[1]]
+    turned = rotation.about_z(jnp.concatenate(parts, axis=1), rotation.opposite(turn)[:, None])
+    return _flat(inputs, turned)
+
+
+def with_pooled_statistics(statistics: Statistics, body: Body) -> Statistics:
+    """The statistics of `with_pooled` of those of its inputs: pooled features are left as they are scaled."""
+    pooled = 6 * len(body.links)
+    return Statistics(
+        jnp.concatenate([statistics.mean, jnp.zeros(pooled)]), jnp.concatenate([statistics.spread, jnp.ones(pooled)])
     )
-    turned = rotation.about_z(vectors, rotation.opposite(turn)[:, None])
-    targets = rotation.from_rotation_vector(control)
-    sizes = jnp.broadcast_to(shape[..., :2], (size, links, 2))
-    return _flat(turned, position[..., 2], targets, sizes)
-
-
-def body_statistics(statistics: Statistics, body: Body) -> Statistics:
-    """The statistics of `body_inputs` with the pooled contact features left as they are scaled."""
-    links = len(body.links)
-    start = 3 * (links + 3 * links + links + links + (links - 1) + links)
-    fixed = slice(start, start + 6 * links)
-    return Statistics(statistics.mean.at[fixed].set(0.0), statistics.spread.at[fixed].set(1.0))
 
 
 class Ground(NamedTuple):

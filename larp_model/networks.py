@@ -16,8 +16,11 @@ class Config:
 
     frame: the dynamics network sees the world's axes, or those of the body's heading. predict: it gives the next
     velocity, integrated semi-implicitly as in the paper, or the change of velocity and a correction of the trapezoidal
-    step. contact: the contact network gives a free feature vector, or an impulse along the contact's own directions,
-    which balls take up directly and articulated bodies see as a feature. skip: residual connections.
+    step. contact: the contact network gives a free feature vector that the dynamics networks see, or an impulse along
+    the contact's own directions, which balls take up directly and to which articulated bodies have a network of their
+    own, of the contact network's size, that adds to the dynamics network's change. skip: residual connections. aided:
+    the networks also see what they would else have to find out from rotations: the torques of the servos and how the
+    ends of the links are to the ground.
     """
 
     name: str
@@ -31,6 +34,7 @@ class Config:
     predict: Literal["velocity", "change"]
     contact: Literal["feature", "impulse"]
     skip: bool
+    aided: bool
 
     def __post_init__(self) -> None:
         for field in ("layers", "width", "contact_layers", "contact_width", "ball_layers", "ball_width"):
@@ -46,8 +50,8 @@ class Config:
                 raise ValueError(f"config.{field} is {getattr(self, field)!r}, but must be one of {choices}")
 
 
-PAPER = Config("paper", 12, 512, 6, 128, 12, 128, "world", "velocity", "feature", skip=False)
-COMPACT = Config("compact", 6, 256, 4, 128, 2, 32, "heading", "change", "impulse", skip=True)
+PAPER = Config("paper", 12, 512, 6, 128, 12, 128, "world", "velocity", "feature", skip=False, aided=False)
+COMPACT = Config("compact", 6, 256, 4, 128, 2, 32, "heading", "change", "impulse", skip=True, aided=True)
 CONFIGS = {config.name: config for config in (PAPER, COMPACT)}
 
 

@@ -6,6 +6,7 @@ choices of `networks.Config`.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -14,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from larp_model import features, rotation
+from larp_model import contact, features, rotation
 from larp_model import state as packed
 from larp_model.features import Statistics
 from larp_model.networks import Config, Perceptron
@@ -23,6 +24,8 @@ from larp_model.scene import Body, Pair, Scene
 # Solid spheres: moment of inertia / (mass x radius^2).
 SPHERE = 0.4
 # Bounds of what the networks may add, so that no state, however odd, is thrown out of the world.
+# Impulse [N s] from which a body's response is heard in full.
+FELT = 0.2
 # Contact: share of the free impact, normal speed [m/s], slide, binormal, upward speed [m/s], lag [ms].
 CONTACT_BOUNDS = (1.0, 3.0, 1.0, 1.0, 3.0, 5.0)
 # Ball on the ground: share of the free bounce, speed [m/s], stick, drag, grip, roll, twist, lag [ms].
@@ -62,9 +65,30 @@ def dynamics_network(config: Config, body: Body) -> Perceptron:
     """f_d for a body's kind."""
     if by_scalars(config, body):
         return Perceptron(config.ball_layers, config.ball_width, len(BALL_BOUNDS), config.skip)
-    outputs = len(body.links) * (6 if config.predict == "velocity" else 12)
+    outputs = changes_of(config, body)
     layers, width = (config.ball_layers, config.ball_width) if body.is_ball else (config.layers, config.width)
     return Perceptron(layers, width, outputs, config.skip)
+
+
+def changes_of(config: Config, body: Body) -> int:
+    """How many numbers say how a body moves on."""
+    return len(body.links) * (6 if config.predict == "velocity" else 12)
+
+
+def responds(scene: Scene, config: Config, body: Body) -> bool:
+    """Whether a body has a network for what impulses do to it."""
+    touched = any(body.name in (pair.first, pair.second) for pair in scene.pairs)
+    return touched and config.contact == "impulse" and not by_scalars(config, body)
+
+
+def response_name(body: Body) -> str:
+    """Name of the network of what impulses do to a body's kind."""
+    return f"response/{body.kind}"
+
+
+def response_network(config: Config, body: Body) -> Perceptron:
+    """Of what impulses do to a body's kind."""
+    return Perceptron(config.contact_layers, config.contact_width, changes_of(config, body), config.skip)
 
 
 def evaluate(network: Perceptron, weights: Weights, name: str, inputs: Array) -> Array:
@@ -157,58 +181,84 @@ def step(
     torque = jnp.zeros((*state.shape[:-1], 3), state.dtype) if torque is None else torque
     shape = features.morphology(scene)[None] if shape is None else shape
     seen = jax.lax.stop_gradient(state) if stop_gradient else state
-    none = jnp.zeros((state.shape[0], len(scene.links), 6), state.dtype)
-    free = seen
-    if scene.pairs and config.contact == "impulse":
+    bodies = list(articulated(scene, config, state, control, torque, shape))
+    free, changed = seen, []
+    if config.contact == "impulse":
+        changed = [dynamics(config, weights, each, each.inputs) for each in bodies]
         # What the motors do meanwhile is no small part of an impact.
-        free = bodies_step(scene, config, weights, seen, control, torque, none, shape)
+        free = moved(scene, config, state, bodies, changed)
         free = jax.lax.stop_gradient(free) if stop_gradient else free
     pooled = contacts(scene, config, weights, seen, free, shape)
-    after = bodies_step(scene, config, weights, state, control, torque, pooled.feature, shape)
+    for index, each in enumerate(bodies):
+        own = pooled.feature[:, each.rows]
+        if config.contact == "feature":
+            changed.append(dynamics(config, weights, each, features.with_pooled(each.inputs, each.turn, own)))
+        elif responds(scene, config, each.body):
+            changed[index] += response(config, weights, each, own)
+    after = moved(scene, config, state, bodies, changed)
     for body in scene.bodies:
         rows = scene.rows(body.name)
         if by_scalars(config, body):
-            own = Pooled(pooled.feature[:, rows], pooled.travel[:, rows])
-            ball = ball_step(scene, config, weights, body, state[:, rows], own, shape[:, rows])
+            own_pooled = Pooled(pooled.feature[:, rows], pooled.travel[:, rows])
+            ball = ball_step(scene, config, weights, body, state[:, rows], own_pooled, shape[:, rows])
             after = after.at[:, rows].set(ball)
     return after
 
 
-def bodies_step(
-    scene: Scene, config: Config, weights: Weights, state: Array, control: Array, torque: Array, pooled: Array,
-    shape: Array,
-) -> Array:  # fmt: skip
-    """One step of all bodies that have a dynamics network; balls by scalars stay as they are."""
-    apart = features.displacement(scene, state, shape)
-    parts, joint = [], 0
+class Seen(NamedTuple):
+    """A body with a dynamics network: its rows in the state, its frame (B, 2) and inputs (B, F)."""
+
+    body: Body
+    rows: slice
+    turn: Array
+    inputs: Array
+
+
+def articulated(
+    scene: Scene, config: Config, state: Array, control: Array, torque: Array, shape: Array
+) -> Iterator[Seen]:
+    """All bodies that have a dynamics network, in states (B, L, 13)."""
+    apart, joint = features.displacement(scene, state, shape), 0
     for body in scene.bodies:
         rows, motors = scene.rows(body.name), scene.motor_rows(body.name)
         joints = slice(joint, joint + len(body.joints))
         joint += len(body.joints)
-        if by_scalars(config, body):
-            parts.append(state[:, rows])
-            continue
-        parts.append(
-            body_step(
-                scene, config, weights, body, state[:, rows], control[:, motors], torque[:, rows], apart[:, joints],
-                pooled[:, rows], shape[:, rows],
-            )
-        )  # fmt: skip
-    return jnp.concatenate(parts, axis=1)
+        if not by_scalars(config, body):
+            turn = frame(config, state[:, rows])
+            inputs = features.body_inputs(
+                body, turn, state[:, rows], control[:, motors], torque[:, rows], apart[:, joints], shape[:, rows],
+                config.aided, scene.dt,
+            )  # fmt: skip
+            yield Seen(body, rows, turn, inputs)
 
 
-def body_step(
-    scene: Scene, config: Config, weights: Weights, body: Body, state: Array, control: Array, torque: Array,
-    apart: Array, pooled: Array, shape: Array,
-) -> Array:  # fmt: skip
-    """One step of a body (B, n, 13) through its dynamics network."""
-    name, links = dynamics_name(body), len(body.links)
-    turn = frame(config, state)
-    inputs = features.body_inputs(body, turn, state, control, torque, apart, pooled, shape)
-    outputs = evaluate(dynamics_network(config, body), weights, name, inputs)
-    outputs = weights.outputs[name].restore(bounded(outputs, CHANGE_BOUND)).reshape(state.shape[0], -1, 3)
-    change = rotation.about_z(outputs, turn[:, None]).reshape(state.shape[0], -1, links, 3)
-    return integrate(config, state, change, scene.dt)
+def dynamics(config: Config, weights: Weights, seen: Seen, inputs: Array) -> Array:
+    """The outputs (B, 2 or 4, n, 3) of a body's dynamics network, world frame; see `integrate`."""
+    name = dynamics_name(seen.body)
+    outputs = evaluate(dynamics_network(config, seen.body), weights, name, inputs)
+    return to_world(weights.outputs[name].restore(bounded(outputs, CHANGE_BOUND)), seen)
+
+
+def response(config: Config, weights: Weights, seen: Seen, pooled: Array) -> Array:
+    """What the pooled impulses (B, n, 6) add to `dynamics`; exactly nothing where there are none."""
+    inputs = features.with_pooled(seen.inputs, seen.turn, pooled)
+    outputs = evaluate(response_network(config, seen.body), weights, response_name(seen.body), inputs)
+    felt = jnp.tanh(contact.norm(pooled[..., :3]).sum(axis=-1, keepdims=True) / FELT)
+    return to_world(weights.outputs[dynamics_name(seen.body)].spread * bounded(outputs, CHANGE_BOUND) * felt, seen)
+
+
+def to_world(outputs: Array, seen: Seen) -> Array:
+    """A network's outputs (B, O) as vectors (B, 2 or 4, n, 3) in the world frame."""
+    size = outputs.shape[0]
+    turned = rotation.about_z(outputs.reshape(size, -1, 3), seen.turn[:, None])
+    return turned.reshape(size, -1, len(seen.body.links), 3)
+
+
+def moved(scene: Scene, config: Config, state: Array, bodies: list[Seen], changed: list[Array]) -> Array:
+    """The states (B, L, 13) after the changes of these bodies; all others stay as they are."""
+    for each, change in zip(bodies, changed, strict=True):
+        state = state.at[:, each.rows].set(integrate(config, state[:, each.rows], change, scene.dt))
+    return state
 
 
 def frame(config: Config, state: Array) -> Array:
@@ -346,6 +396,9 @@ def initial_weights(scene: Scene, config: Config, key: Array, statistics: Measur
     networks: dict[str, Any] = {}
     modules = {dynamics_name(body): dynamics_network(config, body) for body in scene.bodies}
     modules |= {contact_name(scene, pair): contact_network(config) for pair in scene.pairs}
+    modules |= {
+        response_name(body): response_network(config, body) for body in scene.bodies if responds(scene, config, body)
+    }
     for index, (name, module) in enumerate(sorted(modules.items())):
         size = statistics[name][0].mean.shape[0]
         networks[name] = module.init(jax.random.fold_in(key, index), jnp.zeros((1, size)))
@@ -361,38 +414,33 @@ def measure(scene: Scene, config: Config, before: Array, after: Array, control: 
     for the one without contact.
     """
     shape = features.morphology(scene)[None]
-    apart, joint = features.displacement(scene, before, shape), 0
-    pooled = jnp.zeros((*before.shape[:2], 6))
     rarely = 1e-3
     free = after
     found: Measured = {}
     for body in scene.bodies:
-        rows, motors = scene.rows(body.name), scene.motor_rows(body.name)
-        state = before[:, rows]
+        rows = scene.rows(body.name)
         if by_scalars(config, body):
-            ground = features.ball_inputs(
-                body, state[:, 0], pooled[:, rows][:, 0], shape[:, rows][:, 0], scene.gravity, scene.dt
-            )
+            ball, none = before[:, rows][:, 0], jnp.zeros((len(before), 6))
+            ground = features.ball_inputs(body, ball, none, shape[:, rows][:, 0], scene.gravity, scene.dt)
             found[dynamics_name(body)] = Statistics.of(ground.inputs, ground.near + rarely), None
-            free = free.at[:, rows].set(state)
-            continue
-        joints = slice(joint, joint + len(body.joints))
-        joint += len(body.joints)
-        turn = frame(config, state)
-        inputs = features.body_inputs(
-            body, turn, state, control[:, motors], torque[:, rows], apart[:, joints], pooled[:, rows], shape[:, rows]
-        )
-        outputs = changes(config, state, after[:, rows], scene.dt).reshape(state.shape[0], -1, 3)
-        outputs = rotation.about_z(outputs, rotation.opposite(turn)[:, None]).reshape(state.shape[0], -1)
-        statistics = features.body_statistics(Statistics.of(inputs), body)
-        found[dynamics_name(body)] = statistics, Statistics.of(outputs)
+            free = free.at[:, rows].set(before[:, rows])
+    for seen in articulated(scene, config, before, control, torque, shape):
+        body, rows = seen.body, seen.rows
+        outputs = changes(config, before[:, rows], after[:, rows], scene.dt).reshape(len(before), -1, 3)
+        outputs = rotation.about_z(outputs, rotation.opposite(seen.turn)[:, None]).reshape(len(before), -1)
+        alone = Statistics.of(seen.inputs)
+        touched = features.with_pooled_statistics(alone, body)
+        inputs = touched if config.contact == "feature" else alone
+        found[dynamics_name(body)] = inputs, Statistics.of(outputs)
+        if responds(scene, config, body):
+            found[response_name(body)] = touched, None
     for pair in scene.pairs:
         touch = features.contact_inputs(scene, pair, before, free, shape)
         near = touch.near.reshape(-1) + rarely
         if config.contact == "feature":
-            seen = jnp.concatenate(features.paper_contact_inputs(scene, pair, before, shape), axis=1)
+            sights = jnp.concatenate(features.paper_contact_inputs(scene, pair, before, shape), axis=1)
             near = jnp.tile(touch.near, (1, 2)).reshape(-1) + rarely
         else:
-            seen = touch.inputs
-        found[contact_name(scene, pair)] = Statistics.of(seen.reshape(-1, seen.shape[-1]), near), None
+            sights = touch.inputs
+        found[contact_name(scene, pair)] = Statistics.of(sights.reshape(-1, sights.shape[-1]), near), None
     return found

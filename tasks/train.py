@@ -46,18 +46,16 @@ class Stage(NamedTuple):
 
 # Single steps around contacts teach impacts, at a twentieth of a rollout's price; rollouts teach the human to stay
 # true. Rollouts would blur the impacts: a late foot makes any launch look wrong.
-HUMAN, IMPACTS = ("dynamics/human",), ("dynamics/ball", "contact")
+HUMAN, IMPACTS = ("dynamics/human",), ("dynamics/ball", "contact", "response")
 STEPS = training.Recipe(6000, 512, ((1, 1.0),), learning_rate=1e-3, before_contact=2, after_contact=3, loss=LOSS)
 ROLLOUTS = training.Recipe(8000, 256, ((4, 0.1), (8, 0.2), (20, 0.7)), learning_rate=5e-4, loss=LOSS, only=HUMAN)
-AGAIN = replace(ROLLOUTS, updates=2000, curriculum=((20, 1.0),), learning_rate=2e-4)
+AGAIN = replace(ROLLOUTS, updates=3000, curriculum=((20, 1.0),), learning_rate=2e-4)
+STRIKES = replace(STEPS, updates=30000, contact_share=0.9, before_contact=1, after_contact=2, only=IMPACTS)
 STAGES = (
     Stage("steps", "", STEPS),
     Stage("rollouts", "", ROLLOUTS),
     Stage("planned1", "planned", AGAIN),
-    Stage("struck", "contacts", replace(AGAIN, updates=3000)),
-    Stage(
-        "impacts", "", replace(STEPS, updates=30000, contact_share=0.9, before_contact=1, after_contact=2, only=IMPACTS)
-    ),
+    Stage("impacts", "contacts", STRIKES),
 )
 
 
@@ -84,15 +82,12 @@ def planned_episodes(kick: Kick, weights: Path, tasks: int, elites: int, seed: i
 def on_policy_contacts(
     scene: Scene, random: Episodes, planned: Episodes, count: int, seed: int
 ) -> tuple[Episodes, int]:
-    """Contacts of random episodes and of the planner's candidates, disturbed: `count` of each, as long as a rollout.
+    """Contacts of random episodes and of the planner's candidates, disturbed: `count` of each.
 
     Returns the episodes and how many diverged.
     """
     made, dropped = zip(
-        *(
-            contact_episodes(scene, source, count, seed + number, AGAIN.curriculum[0][0] + 5)
-            for number, source in enumerate((random, planned))
-        ),
+        *(contact_episodes(scene, source, count, seed + number) for number, source in enumerate((random, planned))),
         strict=True,
     )
     return truth_episodes.join(made), sum(dropped)
@@ -135,7 +130,7 @@ def main(
         folder / "random.npz", scene, lambda: random_episodes(scene, kick.reference, episodes, seed), console
     )
     impacts = stored_episodes(
-        folder / "impacts.npz", scene, lambda: contact_episodes(scene, random, 2 * episodes, seed + 1), console
+        folder / "contacts.npz", scene, lambda: contact_episodes(scene, random, 2 * episodes, seed + 1), console
     )
     sources = [random, impacts]
     learned: Weights | None = None

@@ -42,13 +42,13 @@ def episodes(scene: Scene, reference: Reference) -> Episodes:
 @pytest.fixture(scope="session")
 def compact() -> Config:
     """The shipped kind of model, as small as it can be."""
-    return Config("tiny", 2, 16, 2, 16, 2, 16, "heading", "change", "impulse", skip=True)
+    return Config("tiny", 2, 16, 2, 16, 2, 16, "heading", "change", "impulse", skip=True, aided=True)
 
 
 @pytest.fixture(scope="session")
 def paper() -> Config:
     """The paper's kind of model, as small as it can be."""
-    return Config("tiny_paper", 2, 16, 2, 16, 2, 16, "world", "velocity", "feature", skip=False)
+    return Config("tiny_paper", 2, 16, 2, 16, 2, 16, "world", "velocity", "feature", skip=False, aided=False)
 
 
 def random_weights(scene: Scene, config: Config, episodes: Episodes) -> Weights:

@@ -245,9 +245,9 @@ def test_shapes_that_do_not_fit_are_refused(
 
 def test_an_unknown_choice_is_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"config\.width is 0"):
-        Config("c", 2, 0, 2, 16, 2, 16, "heading", "change", "impulse", skip=True)
+        Config("c", 2, 0, 2, 16, 2, 16, "heading", "change", "impulse", skip=True, aided=True)
     with pytest.raises(ValueError, match=r"config\.frame is 'sideways'"):
-        Config("c", 2, 8, 2, 16, 2, 16, "sideways", "change", "impulse", skip=True)  # type: ignore[arg-type]
+        Config("c", 2, 8, 2, 16, 2, 16, "sideways", "change", "impulse", skip=True, aided=True)  # type: ignore[arg-type]
 
 
 def test_losses_of_the_truth_are_zero_and_grow_with_the_error(scene: Scene, episodes: Episodes) -> None:
