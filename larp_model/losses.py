@@ -30,6 +30,7 @@ class LossWeights(NamedTuple):
     velocity: float = 0.0
     far: float = math.inf
     fast: float = 1.0
+    arm: float = 0.0
 
 
 def pseudo_huber(squared: Array, limit: float) -> Array:
@@ -52,6 +53,11 @@ def rotation(predicted: Array, true: Array) -> Array:
 def velocity(predicted: Array, true: Array) -> Array:
     """Squared difference (*, L) [m^2/s^2] of the links' velocities."""
     return jnp.sum((packed.velocity(predicted) - packed.velocity(true)) ** 2, axis=-1)
+
+
+def spin(predicted: Array, true: Array) -> Array:
+    """Squared difference (*, L) [rad^2/s^2] of the links' angular velocities."""
+    return jnp.sum((packed.angular_velocity(predicted) - packed.angular_velocity(true)) ** 2, axis=-1)
 
 
 def displacement(scene: Scene, predicted: Array, shape: Array) -> Array:
@@ -78,6 +84,8 @@ def total(
         "rotation": mean(rotation(predicted, true)),
         "displacement": mean(displacement(scene, predicted, shape)),
         "velocity": mean(emphasis * pseudo_huber(velocity(predicted, true), weights.fast)),
+        "spin": mean(emphasis * pseudo_huber(weights.arm**2 * spin(predicted, true), weights.fast)),
     }
-    loss = jnp.sum(jnp.stack([getattr(weights, name) * value for name, value in terms.items()]))
+    factors = weights._asdict() | {"spin": weights.velocity}
+    loss = jnp.sum(jnp.stack([factors[name] * value for name, value in terms.items()]))
     return loss, terms | {"lost": 1.0 - jnp.mean(kept)}

@@ -33,7 +33,7 @@ from tasks.kick import WEIGHTS, Kick, models_of, planners_of, prepare, remember_
 
 EVALUATION_SEED = 1
 # Errors of a velocity count linearly: the median launch matters, not the worst.
-LOSS = LossWeights(velocity=1e-2, far=0.05, fast=0.1)
+LOSS = LossWeights(velocity=1e-2, far=0.05, fast=0.1, arm=0.14)
 
 
 class Stage(NamedTuple):
