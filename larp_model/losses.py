@@ -21,8 +21,8 @@ class LossWeights(NamedTuple):
     """Weights of the terms, and how far their errors count as squares.
 
     velocity [s^2] is not in the paper, which rightly finds that it cannot replace position. Errors beyond `far` [m] and
-    `fast` [m/s] count linearly: impacts that nothing can predict would otherwise drown those that can be learned. Angular
-    velocities count as velocities at a distance of `arm` [m]: single steps hardly teach them otherwise.
+    `fast` [m/s] count linearly: impacts that nothing can predict would otherwise drown those that can be learned.
+    Angular velocities count as velocities at a distance of `arm` [m]: single steps hardly teach them otherwise.
     """
 
     position: float = 1.0
