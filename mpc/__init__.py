@@ -4,8 +4,9 @@ from mpc.cem import CEM
 from mpc.cost import CostTerm, absolute, evaluate, l2, nearest_on_path, quadratic
 from mpc.dynamics import Continued, Dynamics, MujocoDynamics
 from mpc.gradient import Gradient
-from mpc.planner import Plan, PlanInfo, Planner, Verified
+from mpc.planner import Plan, PlanInfo, Planner
 from mpc.spline import interpolate, shift
+from mpc.verified import Verified
 
 __all__ = [
     "CEM",

@@ -46,23 +46,35 @@ class CostTerm:
         require_weight(self.name, self.weight)
 
 
+def residuals(
+    terms: Sequence[CostTerm], states: jax.Array, controls: jax.Array, context: Any = None
+) -> dict[str, jax.Array]:
+    """Each term's residual of one candidate, (R,) or (T, R)."""
+    found = {term.name: term.residual(states, controls, context) for term in terms}
+    for name, residual in found.items():
+        if residual.ndim not in (1, 2):
+            raise ValueError(f"residual of {name!r}: got shape {residual.shape}, needs (R,) or (T, R)")
+    return found
+
+
 def evaluate(
     terms: Sequence[CostTerm],
     states: jax.Array,
     controls: jax.Array,
     context: Any = None,
     weights: Mapping[str, jax.Array | float] | None = None,
+    corrections: Mapping[str, jax.Array] | None = None,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Cost of one candidate, states (H', L, 13) under controls (H, J, 3), and each term's weighted share.
 
-    `weights` replaces the terms' own by name. The total is +inf where a state or the sum is not finite: such
-    a candidate is never chosen. The shares are reported as they are.
+    `weights` replaces the terms' own by name; `corrections` are added to the residuals that they name. The
+    total is +inf where a state or the sum is not finite: such a candidate is never chosen. The shares are
+    reported as they are.
     """
     shares = {}
+    found = residuals(terms, states, controls, context)
     for term in terms:
-        residual = term.residual(states, controls, context)
-        if residual.ndim not in (1, 2):
-            raise ValueError(f"residual of {term.name!r}: got shape {residual.shape}, needs (R,) or (T, R)")
+        residual = found[term.name] + (corrections or {}).get(term.name, 0.0)
         shares[term.name] = (weights or {}).get(term.name, term.weight) * jnp.mean(term.norm(residual))
     total = jnp.sum(jnp.stack(list(shares.values())))
     finite = jnp.isfinite(total) & jnp.all(jnp.isfinite(states))

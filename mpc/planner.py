@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -12,11 +11,12 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from mpc.cem import CEM
-from mpc.cost import CostTerm, evaluate, require_weight
+from mpc.cost import CostTerm, evaluate, require_weight, residuals
 from mpc.dynamics import Dynamics
 from mpc.gradient import Gradient
-from mpc.search import Search, coloured_noise
+from mpc.search import Score, Search, coloured_noise
 from mpc.spline import Interpolation, interpolate, shift
+from mpc.verified import Residuals, Verified
 
 
 class Plan(NamedTuple):
@@ -31,14 +31,6 @@ class Plan(NamedTuple):
     def knots(self) -> jax.Array:
         """The plan itself (K, J, 3) [rad]: the best candidate, never an average."""
         return self.elites[0]
-
-
-@dataclass(frozen=True)
-class Verified:
-    """An optimiser whose candidates are tried in other, truer dynamics than the planner's own."""
-
-    dynamics: Dynamics
-    optimizer: CEM | Gradient
 
 
 Optimizer = CEM | Gradient | Verified
@@ -69,7 +61,7 @@ class Planner:
     theta are `knots` offsets from the reference, evenly spaced from the first control to the last, so that
     zero is the reference itself. The optimisers run in the order given, each on what the one before it found:
     `CEM` alone, `Gradient` alone (on random starts around the reference), or CEM and then Gradient on its
-    elites. `Verified` optimisers, if any, come last: the planner's own dynamics propose, truer ones decide.
+    elites. `Verified`, if any, comes last: the planner's own dynamics propose, truer ones decide.
 
     `spread` (J, 3) [rad] is the standard deviation of a first plan's candidates; 0 locks an axis. A later
     plan starts from the last one's spread, widened towards the first by the share `reheat`. `lower` and
@@ -109,17 +101,9 @@ class Planner:
         self._check()
         self.control_times = dt * np.arange(horizon, dtype=np.float32)
         self.knot_times = np.linspace(0, self.control_times[-1], knots, dtype=np.float32)
-        self.elites = max(optimizer.elites for _, optimizer in self._stages)
+        self.elites = max(optimizer.elites for optimizer in self.optimizers)
         self._compiled: dict[Any, Any] = {}
         self._controls = jax.jit(self._controls_of)
-
-    @property
-    def _stages(self) -> list[tuple[Dynamics, CEM | Gradient]]:
-        """Each optimiser and the dynamics in which it tries its candidates."""
-        return [
-            (each.dynamics, each.optimizer) if isinstance(each, Verified) else (self.dynamics, each)
-            for each in self.optimizers
-        ]
 
     def init(self, key: jax.Array, now: float = 0.0) -> Plan:
         """The plan that follows the reference from `now` [s]; its other elites are drawn around it."""
@@ -149,9 +133,7 @@ class Planner:
         begin = time.perf_counter()
         plan, cost, terms, states, costs, elite_costs = jax.block_until_ready(compiled(*arguments))
         seconds = time.perf_counter() - begin
-        tried = [sum(len(each) for each in stage) for stage in costs]
-        verified = [isinstance(each, Verified) for each in self.optimizers]
-        costs = [np.asarray(each) for stage in costs for each in stage]
+        costs = [np.asarray(each) for each in costs]
         return plan, PlanInfo(
             cost=float(cost),
             terms={name: float(value) for name, value in terms.items()},
@@ -160,7 +142,7 @@ class Planner:
             elite_costs=np.asarray(elite_costs),
             finite=sum(int(np.isfinite(each).sum()) for each in costs),
             candidates=sum(len(each) for each in costs),
-            verified=sum(count for count, other in zip(tried, verified, strict=True) if other),
+            verified=sum(each.rollouts for each in self.optimizers if isinstance(each, Verified)),
             seconds=seconds,
             compile_seconds=compile_seconds,
         )
@@ -188,30 +170,35 @@ class Planner:
         context: Any,
         weights: dict[str, jax.Array],
         now: jax.Array,
-    ) -> tuple[Plan, jax.Array, dict[str, jax.Array], jax.Array, list[list[jax.Array]], jax.Array]:
+    ) -> tuple[Plan, jax.Array, dict[str, jax.Array], jax.Array, list[jax.Array], jax.Array]:
         """The whole step, traced once: shift, improve, look at the best."""
 
-        def predict(dynamics: Dynamics, knots: jax.Array) -> tuple[jax.Array, dict[str, jax.Array], jax.Array]:
+        def roll_out(dynamics: Dynamics, knots: jax.Array) -> tuple[jax.Array, jax.Array]:
             controls = jax.vmap(self._controls_of, (0, None))(knots, reference)
-            states = dynamics.rollout(jnp.broadcast_to(state, (len(knots), *state.shape)), controls)
-            one = partial(evaluate, self.terms, context=context, weights=weights)
-            return *jax.vmap(one)(states, controls), states
+            return dynamics.rollout(jnp.broadcast_to(state, (len(knots), *state.shape)), controls), controls
 
-        def cost_in(dynamics: Dynamics, knots: jax.Array) -> jax.Array:
-            return predict(dynamics, knots)[0]
+        def score(corrections: Residuals) -> Score:
+            one = partial(evaluate, self.terms, context=context, weights=weights, corrections=corrections)
+            return lambda knots: jax.vmap(one)(*roll_out(self.dynamics, knots))[0]
+
+        def trial(dynamics: Dynamics | None, knots: jax.Array) -> tuple[jax.Array, Residuals]:
+            states, controls = roll_out(dynamics or self.dynamics, knots)
+            costs, _ = jax.vmap(partial(evaluate, self.terms, context=context, weights=weights))(states, controls)
+            return costs, jax.vmap(partial(residuals, self.terms, context=context))(states, controls)
 
         key, draw = jax.random.split(plan.key)
-        warm = self._shifted(plan, now - plan.start)
-        search, costs, tried_in = warm, [], self.dynamics
-        for dynamics, optimizer in self._stages:
+        search = self._shifted(plan, now - plan.start)
+        last, costs = search.elites[0], []
+        for optimizer in self.optimizers:
             draw, phase = jax.random.split(draw)
-            if dynamics is not tried_in:  # The costs so far are other dynamics'; and they may have lost the last plan.
-                elites = jnp.concatenate([warm.elites[:1], search.elites[:-1]])
-                search, tried_in = search._replace(elites=elites, costs=warm.costs), dynamics
-            search, tried = optimizer.improve(search, phase, partial(cost_in, dynamics))
-            costs.append(tried)
+            if isinstance(optimizer, Verified):
+                search, tried = optimizer.improve(search, last, phase, trial, score)
+            else:
+                search, tried = optimizer.improve(search, phase, score({}))
+            costs.extend(tried)
         elites = jnp.where(jnp.isfinite(search.costs)[:, None, None, None], search.elites, search.elites[0])
-        cost, shares, states = jax.tree.map(lambda leaf: leaf[0], predict(self.dynamics, elites[:1]))
+        states, controls = jax.tree.map(lambda leaf: leaf[0], roll_out(self.dynamics, elites[:1]))
+        cost, shares = evaluate(self.terms, states, controls, context, weights)
         return Plan(elites, search.spread, now, key), cost, shares, states, costs, search.costs
 
     def _shifted(self, plan: Plan, elapsed: jax.Array) -> Search:
@@ -286,13 +273,13 @@ class Planner:
             raise ValueError(f"terms: got {names}, needs at least one, each with its own name")
         if not self.optimizers:
             raise ValueError("optimizers: got none, needs CEM, Gradient or both")
-        kinds = [isinstance(each, Verified) for each in self.optimizers]
-        if kinds != sorted(kinds):
-            raise ValueError("optimizers: got a Verified one before another, needs all Verified ones last")
-        least = min((min(each.sizes) for _, each in self._stages if isinstance(each, CEM)), default=None)
-        for dynamics, each in self._stages:
-            if isinstance(each, Gradient) and not dynamics.differentiable:
-                model = type(dynamics).__name__
+        if any(isinstance(each, Verified) for each in self.optimizers[:-1]):
+            raise ValueError("optimizers: got Verified before another, needs it last")
+        searching = [each.optimizer if isinstance(each, Verified) else each for each in self.optimizers]
+        least = min((min(each.sizes) for each in searching if isinstance(each, CEM)), default=None)
+        for each in searching:
+            if isinstance(each, Gradient) and not self.dynamics.differentiable:
+                model = type(self.dynamics).__name__
                 raise ValueError(f"optimizers: got Gradient, needs differentiable dynamics, not {model}")
             if least is not None and each.elites > least:
                 raise ValueError(f"optimizers: got {each.elites} elites, CEM's smallest round has {least}")

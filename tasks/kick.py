@@ -18,7 +18,6 @@ import json
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -38,7 +37,6 @@ from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from larp_model.truth.mujoco import Truth
 from mpc import (
-    CEM,
     Continued,
     CostTerm,
     Dynamics,
@@ -55,6 +53,7 @@ from mpc.planner import Optimizer
 from tasks import references
 from tasks.data import stray
 from tasks.gap import contact_step, gap, told
+from tasks.presets import Preset, preset_of
 from tasks.references import Reference
 from tasks.standing import Standing
 from viewer import LivePage, Recording, kick_picture, nearest_approach, write_html
@@ -70,26 +69,11 @@ REACHABLE = 0.25
 WEIGHTS = "human_ball"
 # Of the human whom the shipped weights know [m, kg].
 HEIGHT, MASS = 1.75, 70.0
-# Rows that MuJoCo, as the planner's model, rolls out side by side.
-ROWS = 32
+# Rows that MuJoCo, as the planner's model, rolls out side by side; candidates that are tried in it at a time.
+ROWS, TRIED = 32, 8
 
 Pair = np.ndarray | tuple[float, float]
 DynamicsName = Literal["larp", "mujoco"]
-
-
-@dataclass(frozen=True)
-class Preset:
-    """How much a plan may cost: the optimisers of the first plan and of each replan, and steps between replans.
-
-    verify: what tries the last candidates of the first plan and of each replan in the truth, if anything does. stand:
-    optimisers of the plans that keep the human up after the kick.
-    """
-
-    first: tuple[CEM | Gradient, ...]
-    again: tuple[CEM | Gradient, ...]
-    every: int
-    verify: tuple[CEM, CEM] | None = None
-    stand: tuple[CEM | Gradient, ...] = (CEM(samples=64, rounds=2, elites=12, decay=1.0),)
 
 
 class Models(NamedTuple):
@@ -108,27 +92,6 @@ class Planners(NamedTuple):
     again: Planner
     every: int
     stand: Planner
-
-
-# One population size throughout, because every size is compiled apart.
-PRESETS = {
-    "fast": Preset(
-        (CEM(samples=128, rounds=4, elites=16, decay=1.0),),
-        (CEM(samples=64, rounds=1, elites=16, decay=1.0),),
-        every=5,
-    ),
-    "balanced": Preset(
-        (CEM(samples=256, rounds=10, elites=24, decay=1.0),),
-        (CEM(samples=128, rounds=3, elites=24, decay=1.0),),
-        every=4,
-    ),
-    "accurate": Preset(
-        (CEM(samples=512, rounds=12, elites=32, decay=1.0), Gradient(steps=16, elites=32)),
-        (CEM(samples=256, rounds=4, elites=32, decay=1.0),),
-        every=2,
-        verify=(CEM(samples=32, rounds=4, elites=8, decay=1.0), CEM(samples=32, rounds=1, elites=8, decay=1.0)),
-    ),
-}
 
 
 class Kick:
@@ -316,16 +279,18 @@ def miss(path: np.ndarray, target: np.ndarray) -> float:
     return nearest_approach(path, target).distance
 
 
-def models_of(scene: Scene, name: DynamicsName, weights: Path, trained_on: Scene | None = None) -> Models:
+def models_of(
+    scene: Scene, name: DynamicsName, weights: Path, trained_on: Scene | None = None, rows: int = ROWS
+) -> Models:
     """The planners' models; that of the scene goes on with the ball alone once no link can reach it any more.
 
-    trained_on: the scene of the weights, where that is another one.
+    trained_on: the scene of the weights, where that is another one. rows: that MuJoCo rolls out side by side.
     """
     human, ball = scene.bodies[0].name, scene.bodies[-1].name
 
     def model(*bodies: str) -> Dynamics:
         part = scene.only(*bodies)
-        return MujocoDynamics(Truth(part, ROWS)) if name == "mujoco" else Simulator(part, config, learned)
+        return MujocoDynamics(Truth(part, rows)) if name == "mujoco" else Simulator(part, config, learned)
 
     if name == "larp":
         config, learned, manifest = stored.load(weights, trained_on or scene)
@@ -338,24 +303,21 @@ def models_of(scene: Scene, name: DynamicsName, weights: Path, trained_on: Scene
     return Models(Continued(model(human, ball), model(ball), rest, FLIGHT), model(human), name == "larp", used)
 
 
-def planners_of(kick: Kick, preset: str, models: Models) -> Planners:
-    """The preset's planners."""
-    if preset not in PRESETS:
-        raise ValueError(f"preset is {preset!r}, but must be one of {', '.join(PRESETS)}")
-    chosen = PRESETS[preset]
-    first: tuple[Optimizer, ...] = chosen.first
-    again: tuple[Optimizer, ...] = chosen.again
-    if chosen.verify and models.learned:
-        truth = models_of(kick.scene, "mujoco", Path()).whole
+def planners_of(kick: Kick, preset: Preset, models: Models) -> Planners:
+    """The preset's planners; where MuJoCo is the model there is nothing to try in the truth."""
+    first: tuple[Optimizer, ...] = preset.first
+    again: tuple[Optimizer, ...] = preset.again
+    if any(preset.verify) and models.learned:
+        truth = models_of(kick.scene, "mujoco", Path(), rows=TRIED).whole
         first, again = (
-            (*proposing, Verified(truth, search))
-            for proposing, search in zip((first, again), chosen.verify, strict=True)
+            (*proposing, Verified(truth, preset.correct, rounds, TRIED)) if rounds else proposing
+            for proposing, rounds in zip((first, again), preset.verify, strict=True)
         )
     return Planners(
         kick.planner(models.whole, first),
         kick.planner(models.whole, again),
-        chosen.every,
-        Standing(kick.scene, kick.reference).planner(models.human, chosen.stand),
+        preset.every,
+        Standing(kick.scene, kick.reference).planner(models.human, preset.stand),
     )
 
 
@@ -464,12 +426,11 @@ def main(
     goal = checked_target(target)
     if reference is not None and not reference.is_file():
         raise ValueError(f"reference is {str(reference)!r}, but no such file exists")
-    if preset not in PRESETS:
-        raise ValueError(f"preset is {preset!r}, but must be one of {', '.join(PRESETS)}")
+    chosen = preset_of(preset)
     remember_compilations()
     kick = prepare(reference)
     models = models_of(kick.scene, dynamics, weights)  # type: ignore[arg-type]
-    planners = planners_of(kick, preset, models)
+    planners = planners_of(kick, chosen, models)
     page = LivePage(port=port) if view else None
     if page:
         page.begin(kick.scene, goal)

@@ -30,6 +30,7 @@ from larp_model.truth.episodes import Episodes
 from larp_model.truth.mujoco import SUBSTEPS, Truth
 from tasks.data import WINDOWS, contact_episodes, random_episodes, random_task
 from tasks.kick import WEIGHTS, Kick, models_of, planners_of, prepare, remember_compilations, run
+from tasks.presets import preset_of
 
 EVALUATION_SEED = 1
 # Errors of a velocity count linearly: the median launch matters, not the worst.
@@ -69,7 +70,7 @@ def planned_episodes(kick: Kick, weights: Path, tasks: int, elites: int, seed: i
     Returns the episodes, of the plans' horizon, and how many diverged.
     """
     random = np.random.default_rng(seed)
-    planners = planners_of(kick, "balanced", models_of(kick.scene, "larp", weights))
+    planners = planners_of(kick, preset_of("balanced"), models_of(kick.scene, "larp", weights))
     states, controls = [], []
     for index in range(tasks):
         target, shift = random_task(random)

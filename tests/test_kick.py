@@ -15,6 +15,7 @@ from larp_model.bodies import human_and_ball, standing_height
 from mpc import CEM
 from tasks import kick, references
 from tasks.data import random_task
+from tasks.presets import PRESETS, Preset, preset_of
 
 PROTOCOL = {
     "target",
@@ -43,7 +44,7 @@ def task() -> kick.Kick:
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     search = (CEM(samples=32, rounds=2, elites=8),)
-    monkeypatch.setitem(kick.PRESETS, "fast", kick.Preset(search, (CEM(samples=16, rounds=1, elites=8),), every=20))
+    monkeypatch.setitem(PRESETS, "fast", Preset(search, (CEM(samples=16, rounds=1, elites=8),), every=20))
 
 
 def test_the_reference_strikes_at_a_kickers_speed_and_is_still_up_half_a_second_later(task: kick.Kick) -> None:
@@ -81,7 +82,7 @@ def test_tasks_are_drawn_within_the_protocols_bounds() -> None:
 
 
 def test_with_the_truth_as_model_what_is_predicted_happens(task: kick.Kick, small: None) -> None:
-    planners = kick.planners_of(task, "fast", kick.models_of(task.scene, "mujoco", stored.SHIPPED))
+    planners = kick.planners_of(task, preset_of("fast"), kick.models_of(task.scene, "mujoco", stored.SHIPPED))
     target = np.array([3.0, 0.2, 0.4])
     execution = task.run(planners._replace(every=100), target, seed=0)
     report = task.report(execution, target)
@@ -102,7 +103,7 @@ def test_a_kick_end_to_end_leaves_all_its_files_and_they_agree(tmp_path: Path, s
 
 def test_a_target_out_of_reach_is_marked_and_still_gets_a_plan(task: kick.Kick, small: None) -> None:
     models = kick.models_of(task.scene, "larp", stored.SHIPPED / f"{kick.WEIGHTS}.json")
-    planners = kick.planners_of(task, "fast", models)
+    planners = kick.planners_of(task, preset_of("fast"), models)
     target = np.array([0.0, 0.0, 40.0])
     report = task.report(task.run(planners, target, seed=0), target)
     assert not report["reachable"]

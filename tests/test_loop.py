@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpc import CEM, CostTerm, Gradient, Planner, Verified
+from mpc import CEM, CostTerm, Gradient, Plan, Planner, Verified
 from mpc.loop import Phase, Window, execute
 
 HORIZON, DT = 6, 0.01
@@ -96,23 +96,30 @@ def test_planners_see_what_is_sensed_and_the_truth_goes_on_from_the_truth() -> N
 
 
 def test_truer_dynamics_decide_and_their_rollouts_are_counted() -> None:
-    model, truth = Mover(60.0), Mover(100.0)
-    believing = _planner(model)
-    checking = _planner(model, (SEARCH, Verified(truth, CEM(samples=48, rounds=4, elites=6))))
+    model, truth = Mover(85.0), Mover(100.0)
     missed, verified = [], []
-    for planner in (believing, checking):
+    for optimizers in ((SEARCH,), (SEARCH, Verified(truth, SEARCH, rounds=3, candidates=4))):
+        planner = _planner(model, optimizers)
         plan, info = planner.step(planner.init(jax.random.key(1)), START, np.zeros((HORIZON, 1, 3)), TARGET)
-        controls = planner.controls(plan, np.zeros((HORIZON, 1, 3)))
-        end = truth.rollout(jnp.asarray(START)[None], controls[None])[0, -1, 0, :3]
-        missed.append(float(np.linalg.norm(end - TARGET)))
+        missed.append(_missed(planner, plan, truth))
         verified.append(info.verified)
-    assert verified == [0, sum(CEM(samples=48, rounds=4, elites=6).sizes)]
-    assert missed[1] < 0.5 * missed[0]
+    assert verified == [0, 12]
+    assert missed[1] < 0.25 * missed[0]
+
+
+def test_each_trial_in_truer_dynamics_corrects_the_aim() -> None:
+    model, truth = Mover(85.0), Mover(100.0)
+    missed: list[float] = []
+    for rounds in (1, 2):
+        planner = _planner(model, (SEARCH, Verified(truth, SEARCH, rounds, candidates=4)))
+        plan, _ = planner.step(planner.init(jax.random.key(1)), START, np.zeros((HORIZON, 1, 3)), TARGET)
+        missed.append(_missed(planner, plan, truth))
+    assert missed[1] < 0.4 * missed[0]
 
 
 def test_the_last_plan_is_tried_again_in_the_truer_dynamics() -> None:
     model, truth = Mover(20.0), Mover(100.0)
-    planner = _planner(model, (SEARCH, Verified(truth, CEM(samples=12, rounds=1, elites=6))))
+    planner = _planner(model, (SEARCH, Verified(truth, SEARCH, rounds=1, candidates=4)))
     plan, info = planner.step(planner.init(jax.random.key(1)), START, np.zeros((HORIZON, 1, 3)), TARGET)
     costs = [float(info.elite_costs[0])]
     for _ in range(4):
@@ -121,6 +128,26 @@ def test_the_last_plan_is_tried_again_in_the_truer_dynamics() -> None:
     assert all(after <= before + 1e-6 for before, after in pairwise(costs))
 
 
+def test_where_no_trial_is_finite_the_last_plan_stays() -> None:
+    planner = _planner(Mover(60.0), (SEARCH, Verified(Mover(np.nan), SEARCH, rounds=2, candidates=4)))
+    plan, info = planner.step(planner.init(jax.random.key(1)), START, np.zeros((HORIZON, 1, 3)), TARGET)
+    np.testing.assert_array_equal(plan.knots, 0.0)
+    assert info.finite < info.candidates
+
+
 def test_what_is_verified_comes_last() -> None:
     with pytest.raises(ValueError, match="optimizers"):
         _planner(Mover(), (Verified(Mover(50.0), SEARCH), Gradient(steps=1, elites=2)))
+
+
+@pytest.mark.parametrize(("name", "value"), [("rounds", 0), ("candidates", 1)])
+def test_too_few_trials_are_refused_by_name(name: str, value: int) -> None:
+    with pytest.raises(ValueError, match=name):
+        Verified(Mover(), SEARCH, **{name: value})
+
+
+def _missed(planner: Planner, plan: Plan, truth: Mover) -> float:
+    """How far from the target the plan truly ends [m]."""
+    controls = planner.controls(plan, np.zeros((HORIZON, 1, 3)))
+    end = truth.rollout(jnp.asarray(START)[None], controls[None])[0, -1, 0, :3]
+    return float(np.linalg.norm(end - TARGET))

@@ -28,6 +28,7 @@ from mpc.search import coloured_noise
 from tasks.benchmarks import report
 from tasks.data import random_task
 from tasks.kick import WEIGHTS, Kick, Models, models_of, planners_of, prepare, remember_compilations, run
+from tasks.presets import preset_of
 
 # A candidate is one of the plan's elites, moved by this share of the spread of a first plan.
 AROUND = 0.1
@@ -40,7 +41,7 @@ def candidates_of(
 
     Returns a row for each plan, and the episodes of all candidates.
     """
-    planners = planners_of(kick, "balanced", models)
+    planners = planners_of(kick, preset_of("balanced"), models)
     spread, random = jnp.asarray(planners.first.scale), np.random.default_rng(seed)
 
     def costs_in(dynamics: Dynamics) -> Callable[..., tuple[jax.Array, jax.Array]]:

@@ -1,0 +1,89 @@
+"""Candidates tried in truer dynamics than the planner's own, and what that teaches the search."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from mpc.cem import CEM
+from mpc.dynamics import Dynamics
+from mpc.gradient import Gradient
+from mpc.search import Score, Search, best_first
+
+Residuals = dict[str, jax.Array]
+Trial = Callable[[Dynamics | None, jax.Array], tuple[jax.Array, Residuals]]
+"""Costs (N,) and residuals (N, ...) of knots (N, K, J, 3) in these dynamics; None: in the planner's own."""
+
+
+@dataclass(frozen=True)
+class Verified:
+    """The planner's own dynamics propose, truer ones decide, and their verdict corrects the next proposal.
+
+    Each round tries the best candidates in `dynamics`. Between two rounds `optimizer` searches on in the planner's own
+    dynamics, whose residuals are moved to where they are right for the best candidate so far, theta*:
+
+        r(theta) = r_model(theta) + r_true(theta*) - r_model(theta*)
+
+    So a model that errs much alike for neighbouring candidates finds a plan that is good in truth after a few trials,
+    as an archer corrects the aim by the last miss (additive correction of a surrogate: Alexandrov et al. 2001,
+    "Approximation and model management").
+    """
+
+    dynamics: Dynamics
+    optimizer: CEM | Gradient
+    rounds: int = 3
+    """Trials of candidates; one only ranks what was found."""
+    candidates: int = 8
+    """Tried in each round; the plan that is carried on is one of the first round's."""
+
+    def __post_init__(self) -> None:
+        for name, least in {"rounds": 1, "candidates": 2}.items():
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}: got {getattr(self, name)}, needs at least {least}")
+
+    @property
+    def elites(self) -> int:
+        """How many of the best candidates it needs."""
+        return max(self.candidates, self.optimizer.elites)
+
+    @property
+    def rollouts(self) -> int:
+        """How many it asks of the truer dynamics."""
+        return self.rounds * self.candidates
+
+    def improve(
+        self, search: Search, last: jax.Array, key: jax.Array, trial: Trial, score: Callable[[Residuals], Score]
+    ) -> tuple[Search, list[jax.Array]]:
+        """All rounds; also returns every candidate's cost, (N,) a round, the truer dynamics' and the planner's.
+
+        last: knots (K, J, 3) of the plan carried on. score: costs in the planner's own dynamics, corrected.
+        """
+        count, history = self.candidates, []
+        elites = jnp.concatenate([search.elites[: count - 1], last[None], search.elites[count - 1 : -1]])
+        search, best, lowest = search._replace(elites=elites), last, jnp.float32(jnp.inf)
+        _, wanted = jax.tree.map(lambda leaf: leaf[0], trial(None, last[None]))
+        for number, phase in enumerate(jax.random.split(key, self.rounds)):
+            costs, residuals = trial(self.dynamics, search.elites[:count])
+            history.append(costs)
+            first = jnp.argmin(costs)
+            won = costs[first] < lowest
+            best, lowest = jnp.where(won, search.elites[first], best), jnp.where(won, costs[first], lowest)
+            wanted = jax.tree.map(lambda new, old: jnp.where(won, new[first], old), residuals, wanted)  # noqa: B023
+            search = _ranked(search, best, lowest, costs)
+            if number == self.rounds - 1:
+                break
+            _, believed = trial(None, best[None])
+            corrections = jax.tree.map(lambda true, mine: true - mine[0], wanted, believed)
+            search = search._replace(mean=best, costs=jnp.full(len(search.costs), jnp.inf))
+            search, tried = self.optimizer.improve(search, phase, score(corrections))
+            history.extend(tried)
+        return search, history
+
+
+def _ranked(search: Search, best: jax.Array, lowest: jax.Array, costs: jax.Array) -> Search:
+    """The search with its first elites in the order of their costs (N,), the best of all before them."""
+    count = len(costs)
+    tried, costs = best_first(search.elites[:count], costs, count)
+    elites = jnp.concatenate([best[None], tried[:-1], search.elites[count:]])
+    return search._replace(elites=elites, costs=jnp.concatenate([lowest[None], costs[:-1], search.costs[count:]]))
