@@ -29,9 +29,8 @@ def predict(
     parts = []
     for begin in range(0, len(states), chunk):
         rows = np.minimum(np.arange(begin, begin + chunk), len(states) - 1)
-        parts.append(
-            np.asarray(roll(jnp.asarray(states[rows]), jnp.asarray(controls[rows]), jnp.asarray(torques[rows])))
-        )
+        chosen = [jnp.asarray(each[rows]) for each in (states, controls, torques)]
+        parts.append(np.asarray(roll(chosen[0], chosen[1], torques=chosen[2])))
     return np.concatenate(parts)[: len(states)]
 
 

@@ -359,32 +359,46 @@ class Simulator:
         """States (N, L, 13) after one `scene.dt` under controls (N, J, 3) [rad]."""
         return step(self.scene, self.config, self.weights, state, control, torque, shape)
 
-    def rollout(self, state: Array, controls: Array, torques: Array | None = None, shape: Array | None = None) -> Array:
+    def rollout(
+        self, state: Array, controls: Array, steps: Array | None = None, torques: Array | None = None,
+        shape: Array | None = None,
+    ) -> Array:  # fmt: skip
         """States (N, H, L, 13) after each of H steps from states (N, L, 13) under controls (N, H, J, 3) [rad].
 
-        torques: external, (N, H, L, 3) [N m]. shape: morphology (N or 1, L, 3); the scene's by default.
+        steps (): so many of the H are computed, the rest repeat the last; all by default. torques: external, (N, H, L,
+        3) [N m]. shape: morphology (N or 1, L, 3); the scene's by default.
         """
         links, motors = len(self.scene.links), len(self.scene.motors)
         if state.ndim != 3 or state.shape[1:] != (links, packed.SIZE):
             raise ValueError(f"state has shape {state.shape}, but needs (N, {links}, {packed.SIZE})")
         if controls.ndim != 4 or controls.shape[0] != state.shape[0] or controls.shape[2:] != (motors, 3):
             raise ValueError(f"controls have shape {controls.shape}, but need ({state.shape[0]}, H, {motors}, 3)")
-        return rollout(self.scene, self.config, self.weights, state, controls, torques, shape)
+        return rollout(self.scene, self.config, self.weights, state, controls, torques, shape, steps=steps)
 
 
 def rollout(
     scene: Scene, config: Config, weights: Weights, state: Array, controls: Array, torques: Array | None = None,
-    shape: Array | None = None, stop_gradient: bool = False,
+    shape: Array | None = None, stop_gradient: bool = False, steps: Array | None = None,
 ) -> Array:  # fmt: skip
-    """States (B, H, L, 13) after each of H steps; the arguments are those of `step`, with a time axis second."""
+    """States (B, H, L, 13) after each of H steps; the arguments are those of `step`, with a time axis second.
 
-    def advance(current: Array, inputs: tuple[Array, Array | None]) -> tuple[Array, Array]:
+    steps (): so many of the H are computed, the rest repeat the last; all by default.
+    """
+
+    def advance(current: Array, inputs: tuple[Array, Array | None]) -> Array:
         control, torque = inputs
-        after = step(scene, config, weights, current, control, torque, shape, stop_gradient)
+        return step(scene, config, weights, current, control, torque, shape, stop_gradient)
+
+    def next_state(current: Array, inputs: tuple[Array, tuple[Array, Array | None]]) -> tuple[Array, Array]:
+        number, given = inputs
+        if steps is None:
+            after = advance(current, given)
+        else:
+            after = jax.lax.cond(number < steps, advance, lambda held, _: held, current, given)
         return after, after
 
     by_time = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), (controls, torques))
-    _, states = jax.lax.scan(advance, state, by_time)
+    _, states = jax.lax.scan(next_state, state, (jnp.arange(controls.shape[1]), by_time))
     return jnp.moveaxis(states, 0, 1)
 
 

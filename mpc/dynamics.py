@@ -15,10 +15,11 @@ class Dynamics(Protocol):
     def differentiable(self) -> bool:
         """Whether JAX can differentiate `rollout`."""
 
-    def rollout(self, state: jax.Array, controls: jax.Array) -> jax.Array:
+    def rollout(self, state: jax.Array, controls: jax.Array, steps: jax.Array | None = None) -> jax.Array:
         """States (N, H', L, 13) after steps 1 to H' >= H, from state (N, L, 13), controls (N, H, J, 3) [rad].
 
-        Pure, traceable by JAX, and every row independent of the others. A row that diverged holds NaN.
+        Pure, traceable by JAX, and every row independent of the others. A row that diverged holds NaN. steps (): only
+        so many of the H are wanted; the rest of them repeat the last. A planner that wants all does not pass it.
         """
 
 
@@ -44,19 +45,21 @@ class MujocoDynamics:
     truth: BatchedTruth
     differentiable = False
 
-    def rollout(self, state: jax.Array, controls: jax.Array) -> jax.Array:
+    def rollout(self, state: jax.Array, controls: jax.Array, steps: jax.Array | None = None) -> jax.Array:
         """See `Dynamics.rollout`; H' = H."""
         shape = (*controls.shape[:2], *state.shape[1:])
         result = jax.ShapeDtypeStruct(shape, jnp.float32)
-        return jax.pure_callback(self._simulate, result, state, controls)
+        return jax.pure_callback(self._simulate, result, state, controls, controls.shape[1] if steps is None else steps)
 
-    def _simulate(self, state: jax.Array, controls: jax.Array) -> np.ndarray:
+    def _simulate(self, state: jax.Array, controls: jax.Array, steps: jax.Array) -> np.ndarray:
         start, targets, size = np.asarray(state), np.asarray(controls), self.truth.batch
+        wanted = int(steps)
         result = np.empty((*targets.shape[:2], *start.shape[1:]), np.float32)
         for begin in range(0, len(start), size):
             rows = np.minimum(np.arange(begin, begin + size), len(start) - 1)
-            states, ok = self.truth.rollout(start[rows], targets[rows])
-            result[rows] = np.where(ok[:, None, None, None], states, np.nan)
+            states, ok = self.truth.rollout(start[rows], targets[rows, :wanted])
+            result[rows, :wanted] = np.where(ok[:, None, None, None], states, np.nan)
+        result[:, wanted:] = result[:, wanted - 1 : wanted]
         return result
 
 
@@ -83,9 +86,9 @@ class Continued:
         """True where both models are differentiable."""
         return self.dynamics.differentiable and self.tail.differentiable
 
-    def rollout(self, state: jax.Array, controls: jax.Array) -> jax.Array:
-        """See `Dynamics.rollout`; H' = H + steps."""
-        states = self.dynamics.rollout(state, controls)
+    def rollout(self, state: jax.Array, controls: jax.Array, steps: jax.Array | None = None) -> jax.Array:
+        """See `Dynamics.rollout`; H' = H + `self.steps`."""
+        states = self.dynamics.rollout(state, controls, *(() if steps is None else (steps,)))
         last = states[:, -1]
         followed = self.tail.rollout(last[:, self.links], jnp.zeros((len(state), self.steps, 0, 3)))
         frozen = jnp.repeat(last[:, None], self.steps, axis=1)

@@ -23,10 +23,14 @@ class World(Protocol):
 
 
 class Window(NamedTuple):
-    """What the task wants of the next H steps: reference controls (H, J, 3) [rad] and the residuals' context."""
+    """What the task wants of the next H steps: reference controls (H, J, 3) [rad] and the residuals' context.
+
+    steps: so many of the H suffice; all by default.
+    """
 
     controls: np.ndarray
     context: Any
+    steps: int | None = None
 
 
 def never(step: int, state: np.ndarray) -> bool:
@@ -96,7 +100,8 @@ def execute(
             planner = phase.first if plan is None else phase.again
             before = planner.init(jax.random.fold_in(key, index), step * dt) if plan is None else plan
             wanted = phase.window(step)
-            plan, info = planner.step(before, current[phase.links], wanted.controls, wanted.context, now=step * dt)
+            seen = current[phase.links]
+            plan, info = planner.step(before, seen, wanted.controls, wanted.context, now=step * dt, steps=wanted.steps)
             targets, planned_at = np.asarray(planner.controls(plan, wanted.controls)), step
             execution.replans.append(Replan(step, index, current, plan, info))
         ahead = step - planned_at

@@ -120,15 +120,16 @@ class Planner:
         context: Any = None,
         weights: Mapping[str, float] | None = None,
         now: float = 0.0,
+        steps: int | None = None,
     ) -> tuple[Plan, PlanInfo]:
         """Plans the window that starts `now` [s] in `state` (L, 13), warm-started by the last plan.
 
         `reference` (H, J, 3) [rad] are the controls to start from in this window; `context` any pytree of
-        arrays that the residuals take; `weights` replace those of the terms they name. The plan never costs
-        more, in the dynamics' eyes, than the last plan carried on. If no candidate is finite, that one
-        returns at cost inf.
+        arrays that the residuals take; `weights` replace those of the terms they name. `steps` of the H suffice,
+        if given: the dynamics compute no more of them under control. The plan never costs more, in the
+        dynamics' eyes, than the last plan carried on. If no candidate is finite, that one returns at cost inf.
         """
-        arguments = self._arguments(plan, state, reference, context, weights, now)
+        arguments = self._arguments(plan, state, reference, context, weights, now, steps)
         compiled, compile_seconds = self._compile(arguments)
         begin = time.perf_counter()
         plan, cost, terms, states, costs, elite_costs = jax.block_until_ready(compiled(*arguments))
@@ -137,7 +138,9 @@ class Planner:
         return plan, PlanInfo(
             cost=float(cost),
             terms={name: float(value) for name, value in terms.items()},
-            states=np.asarray(states),
+            states=np.delete(
+                np.asarray(states), np.s_[self.horizon if steps is None else steps : self.horizon], axis=0
+            ),
             costs=costs,
             elite_costs=np.asarray(elite_costs),
             finite=sum(int(np.isfinite(each).sum()) for each in costs),
@@ -153,10 +156,11 @@ class Planner:
         reference: ArrayLike,
         context: Any = None,
         weights: Mapping[str, float] | None = None,
+        steps: int | None = None,
     ) -> float:
         """Compiles `step` ahead for arguments of these shapes; returns the seconds it took."""
         plan = self.init(jax.random.key(0))
-        return self._compile(self._arguments(plan, state, reference, context, weights, 0.0))[1]
+        return self._compile(self._arguments(plan, state, reference, context, weights, 0.0, steps))[1]
 
     def controls(self, plan: Plan, reference: ArrayLike) -> jax.Array:
         """Joint targets (H, J, 3) [rad] of the plan, given the reference (H, J, 3) it was made around."""
@@ -170,12 +174,14 @@ class Planner:
         context: Any,
         weights: dict[str, jax.Array],
         now: jax.Array,
+        steps: jax.Array | None,
     ) -> tuple[Plan, jax.Array, dict[str, jax.Array], jax.Array, list[jax.Array], jax.Array]:
         """The whole step, traced once: shift, improve, look at the best."""
 
         def roll_out(dynamics: Dynamics, knots: jax.Array) -> tuple[jax.Array, jax.Array]:
             controls = jax.vmap(self._controls_of, (0, None))(knots, reference)
-            return dynamics.rollout(jnp.broadcast_to(state, (len(knots), *state.shape)), controls), controls
+            start = jnp.broadcast_to(state, (len(knots), *state.shape))
+            return dynamics.rollout(start, controls, *([] if steps is None else [steps])), controls
 
         def score(corrections: Residuals) -> Score:
             one = partial(evaluate, self.terms, context=context, weights=weights, corrections=corrections)
@@ -232,6 +238,7 @@ class Planner:
         context: Any,
         weights: Mapping[str, float] | None,
         now: float,
+        steps: int | None,
     ) -> tuple:
         """The public arguments, checked, as JAX arrays of fixed shape and type."""
         state = np.asarray(state, np.float32)
@@ -243,13 +250,15 @@ class Planner:
         start = float(plan.start)  # of a clock in 32 bits, hence the tolerance
         if not start - 1e-4 * max(1.0, abs(start)) <= now < np.inf:
             raise ValueError(f"now: got {now} s, needs a time from plan.start, {start} s, on")
+        if steps is not None and not 1 <= steps <= self.horizon:
+            raise ValueError(f"steps: got {steps}, needs 1 to horizon ({self.horizon})")
         current = {term.name: float(term.weight) for term in self.terms}
         for name, weight in (weights or {}).items():
             if name not in current:
                 raise ValueError(f"weights: got {name!r}, needs names of cost terms: {', '.join(current)}")
             require_weight(name, weight)
             current[name] = float(weight)
-        arrays = state, self._reference(reference), context, current, float(now)
+        arrays = state, self._reference(reference), context, current, float(now), steps
         return plan, *jax.tree.map(_array, arrays)
 
     def _reference(self, reference: ArrayLike) -> jax.Array:

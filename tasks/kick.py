@@ -60,6 +60,8 @@ from viewer import LivePage, Recording, kick_picture, nearest_approach, write_ht
 
 # Steps that a plan looks beyond the reference's strike with the whole scene, and then with the ball alone.
 BEYOND, FLIGHT = 15, 120
+# A plan looks at least so many steps ahead, even when the strike is overdue.
+SHORTEST = 15
 # Spread of a first plan, as a share of how far the training data strays from the reference.
 SEARCH = 0.5
 KNOTS = 9
@@ -156,7 +158,7 @@ class Kick:
                     float
                 ),
             }
-            return Window(controls, context)
+            return Window(controls, context, int(np.clip(self.horizon - step, SHORTEST, self.horizon)))
 
         return at
 

@@ -21,7 +21,7 @@ class Mover:
     pace: float = 100.0
     differentiable = True
 
-    def rollout(self, state: jax.Array, controls: jax.Array) -> jax.Array:
+    def rollout(self, state: jax.Array, controls: jax.Array, steps: jax.Array | None = None) -> jax.Array:
         way = jnp.cumsum(self.pace * DT * controls[:, :, 0], axis=1)
         states = jnp.repeat(state[:, None], controls.shape[1], axis=1)
         return states.at[..., :3].add(way[:, :, None])

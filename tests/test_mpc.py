@@ -41,7 +41,7 @@ class PointMass:
 
     differentiable = True
 
-    def rollout(self, state: jax.Array, controls: jax.Array) -> jax.Array:
+    def rollout(self, state: jax.Array, controls: jax.Array, steps: jax.Array | None = None) -> jax.Array:
         return _moving(state, jnp.cumsum(controls[:, :, 0] * 100 * DT, axis=1))
 
 
@@ -51,7 +51,7 @@ class Wall:
 
     differentiable = True
 
-    def rollout(self, state: jax.Array, controls: jax.Array) -> jax.Array:
+    def rollout(self, state: jax.Array, controls: jax.Array, steps: jax.Array | None = None) -> jax.Array:
         velocity = jnp.cumsum(controls[:, :, 0] * 2000 * DT, axis=1)
         states = _moving(state, jnp.cumsum(velocity * DT, axis=1))
         lost = jnp.cumsum(states[..., 0, 0] > 0.5, axis=1) > 0
@@ -64,8 +64,19 @@ class Broken:
 
     differentiable = True
 
-    def rollout(self, state: jax.Array, controls: jax.Array) -> jax.Array:
+    def rollout(self, state: jax.Array, controls: jax.Array, steps: jax.Array | None = None) -> jax.Array:
         return jnp.full((*controls.shape[:2], *state.shape[1:]), jnp.nan)
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Every link moves by 1 along each axis in a step; it has no motors."""
+
+    differentiable = False
+
+    def rollout(self, state: jax.Array, controls: jax.Array, steps: jax.Array | None = None) -> jax.Array:
+        assert controls.shape[2] == 0
+        return _moving(state, jnp.cumsum(jnp.ones((*controls.shape[:2], 3)), axis=1))
 
 
 @dataclass(frozen=True)
@@ -244,6 +255,38 @@ def test_engine_is_called_in_its_own_batches_and_loses_its_lost_rows() -> None:
     np.testing.assert_allclose(states[~lost], PointMass().rollout(state, controls)[~lost], atol=1e-6)
 
 
+@pytest.mark.parametrize("steps", [1, 7, HORIZON])
+def test_an_engine_computes_only_the_steps_that_suffice_and_repeats_the_last(steps: int) -> None:
+    seen = []
+
+    class Counting(Engine):
+        def rollout(self, states: np.ndarray, controls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            seen.append(controls.shape[1])
+            return super().rollout(states, controls)
+
+    controls = 0.02 * jax.random.normal(jax.random.key(0), (5, HORIZON, 1, 3))
+    state = jnp.broadcast_to(jnp.asarray(STATE), (5, 1, 13))
+    states = jax.jit(MujocoDynamics(Counting()).rollout)(state, controls, steps)
+    whole = PointMass().rollout(state, controls)
+    np.testing.assert_allclose(states[:, :steps], whole[:, :steps], atol=1e-6)
+    np.testing.assert_array_equal(states[:, steps:], jnp.repeat(states[:, steps - 1 : steps], HORIZON - steps, axis=1))
+    assert seen == [steps]
+
+
+def test_the_prediction_goes_on_from_the_last_step_that_suffices() -> None:
+    planner = _planner(Continued(MujocoDynamics(Engine()), Drift(), slice(0, 1), 5))
+    _, info = planner.step(planner.init(jax.random.key(0)), STATE, REFERENCE, TARGET, steps=4)
+    assert len(info.states) == 4 + 5
+    np.testing.assert_allclose(np.diff(info.states[3:, 0, :3], axis=0), 1.0, rtol=1e-5)
+
+
+@pytest.mark.parametrize("steps", [0, HORIZON + 1])
+def test_steps_that_are_not_in_the_horizon_are_refused(steps: int) -> None:
+    planner = _planner(MujocoDynamics(Engine()))
+    with pytest.raises(ValueError, match="steps"):
+        planner.step(planner.init(jax.random.key(0)), STATE, REFERENCE, TARGET, steps=steps)
+
+
 def test_planner_runs_on_an_engine() -> None:
     planner = _planner(MujocoDynamics(Engine()))
     _, info = planner.step(planner.init(jax.random.key(0)), STATE, REFERENCE, TARGET)
@@ -251,13 +294,6 @@ def test_planner_runs_on_an_engine() -> None:
 
 
 def test_continued_follows_its_links_and_freezes_the_others() -> None:
-    class Drift:
-        differentiable = False
-
-        def rollout(self, state: jax.Array, controls: jax.Array) -> jax.Array:
-            assert controls.shape == (3, 5, 0, 3)
-            return _moving(state, jnp.cumsum(jnp.ones((3, 5, 3)), axis=1))
-
     state = jax.random.normal(jax.random.key(1), (3, 4, 13))
     controls = jax.random.normal(jax.random.key(2), (3, HORIZON, 1, 3))
     both = Continued(PointMass(), Drift(), slice(1, 3), 5)

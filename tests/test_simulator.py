@@ -116,6 +116,17 @@ def test_steps_make_the_rollout(compact_simulator: Simulator, kicks: tuple[np.nd
     np.testing.assert_allclose(np.stack(after, axis=1), roll(compact_simulator, states, controls)[:, :3], atol=1e-9)
 
 
+def test_steps_that_are_not_wanted_repeat_the_last(
+    compact_simulator: Simulator, kicks: tuple[np.ndarray, np.ndarray]
+) -> None:
+    states, controls = kicks
+    few = np.asarray(
+        jax.jit(compact_simulator.rollout, compiler_options=SOON)(jnp.asarray(states), jnp.asarray(controls), 3)
+    )
+    np.testing.assert_allclose(few[:, :3], roll(compact_simulator, states, controls)[:, :3], atol=1e-9)
+    np.testing.assert_array_equal(few[:, 3:], np.repeat(few[:, 2:3], controls.shape[1] - 3, axis=1))
+
+
 def test_orientations_stay_of_unit_length(simulator: Simulator, kicks: tuple[np.ndarray, np.ndarray]) -> None:
     after = roll(simulator, *kicks)
     np.testing.assert_allclose(np.linalg.norm(after[..., packed.ORIENTATION], axis=-1), 1.0, atol=1e-12)
