@@ -18,6 +18,8 @@ from larp_model.scene import Body, Pair, Scene
 
 # Scale of the pooled contact features, an impulse [N s] and its moment [N m s].
 IMPULSE_SCALE = 1.0, 0.1
+# Links whose gap within a step is larger than this do not feel each other [m].
+NEAR = 0.03
 # Normalised inputs are held within this many standard deviations.
 RANGE = 10.0
 
@@ -231,7 +233,7 @@ class Touch(NamedTuple):
     """Contact of P pairs of links within one step; vectors (B, P, 3) in the world frame.
 
     inputs: (B, P, F) for the contact network, in the first link's frame. gap: (B, P) [m] when the step begins.
-    impact: along the normal. near: (B, P), 1 where the links touch within the step, falling to 0 over 3 cm.
+    impact: along the normal. near: (B, P), 1 where the links touch within the step, falling to 0 over `NEAR`.
     normal: from the first to the second. slide: tangential velocity [m/s] of the first against the second.
     first_arm, second_arm: from the links' centres to the contact [m]. mass: (B, P) effective mass [kg] of the contact
     along the normal, the links' parents included.
@@ -314,7 +316,7 @@ def contact_inputs(scene: Scene, pair: Pair, state: Array, free: Array, shape: A
     acceleration = jnp.sum(gained * found.normal, axis=-1) / scene.dt
     impact = contact.impact(jnp.maximum(-found.distance, 0.0), approach, acceleration, pair.surface, remaining)
     lowest = jnp.minimum(gaps[0], found.distance)
-    near = smooth_gate(lowest, 0.03)
+    near = smooth_gate(lowest, NEAR)
     slide = relative - approach[..., None] * found.normal
 
     given = compliance.compliance(scene, first, matrices, arm1, shape)
@@ -342,6 +344,23 @@ def contact_inputs(scene: Scene, pair: Pair, state: Array, free: Array, shape: A
     which = jnp.broadcast_to(jnp.eye(len(first), dtype=state.dtype), (*time.shape, len(first)))
     inputs = jnp.concatenate([local.reshape(*time.shape, -1), scalars, which], axis=-1)
     return Touch(inputs, gaps[0], impact, near, found.normal, slide, arm1, arm2, mass)
+
+
+def within_reach(scene: Scene, pair: Pair, state: Array, free: Array, shape: Array) -> Array:
+    """() whether any links of the pair, in any of the states (B, L, 13), may come nearer than `contact_inputs` minds.
+
+    False only where all `near` of those inputs are zero: no point of a link moves faster than this bound.
+    """
+    first, second = pair_rows(scene, pair)
+    matrices = rotation.matrix(packed.orientation(state))
+    a, b = (_segments(scene, state, rows, matrices[..., rows, :, :], shape) for rows in (first, second))
+    speeds = []
+    for each in (state, free):
+        velocity, spin = packed.velocity(each), contact.norm(packed.angular_velocity(each))
+        swing = sum(0.5 * shape[..., rows, 0] * spin[..., rows] for rows in (first, second))
+        speeds.append(contact.norm(velocity[..., second, :] - velocity[..., first, :]) + swing)
+    lowest = contact.closest(a, b).distance - scene.dt * jnp.maximum(*speeds)
+    return jnp.any(~(lowest >= NEAR))
 
 
 def paper_contact_inputs(scene: Scene, pair: Pair, state: Array, shape: Array) -> tuple[Array, Array]:

@@ -118,13 +118,18 @@ class Pooled(NamedTuple):
     travel: Array
 
 
+def untouched(state: Array) -> Pooled:
+    """What contacts do to the links of states (B, L, 13) where there are none."""
+    return Pooled(jnp.zeros((*state.shape[:2], 6), state.dtype), jnp.zeros((*state.shape[:2], 3), state.dtype))
+
+
 def contacts(scene: Scene, config: Config, weights: Weights, state: Array, free: Array, shape: Array) -> Pooled:
     """Sum f_c over the contacts of every link (equation 1 of the paper).
 
     state (B, L, 13); free (B, L, 13), what it would become if nothing touched.
     """
-    size, links = state.shape[0], len(scene.links)
-    feature, travel = jnp.zeros((size, links, 6), state.dtype), jnp.zeros((size, links, 3), state.dtype)
+    links = len(scene.links)
+    feature, travel = untouched(state)
     for pair in scene.pairs:
         name = contact_name(scene, pair)
         first, second = features.pair_rows(scene, pair)
@@ -188,13 +193,25 @@ def step(
         # What the motors do meanwhile is no small part of an impact.
         free = moved(scene, config, state, bodies, changed)
         free = jax.lax.stop_gradient(free) if stop_gradient else free
-    pooled = contacts(scene, config, weights, seen, free, shape)
-    for index, each in enumerate(bodies):
-        own = pooled.feature[:, each.rows]
-        if config.contact == "feature":
+
+        def meet() -> tuple[Pooled, list[Array]]:
+            pooled = contacts(scene, config, weights, seen, free, shape)
+            return pooled, [
+                change + response(config, weights, each, pooled.feature[:, each.rows])
+                if responds(scene, config, each.body)
+                else change
+                for each, change in zip(bodies, changed, strict=True)
+            ]
+
+        # Steps without contact are by far the most.
+        near = [features.within_reach(scene, pair, seen, free, shape) for pair in scene.pairs]
+        apart = untouched(state), changed
+        pooled, changed = jax.lax.cond(jnp.stack(near).any(), meet, lambda: apart) if near else apart
+    else:
+        pooled = contacts(scene, config, weights, seen, free, shape)
+        for each in bodies:
+            own = pooled.feature[:, each.rows]
             changed.append(dynamics(config, weights, each, features.with_pooled(each.inputs, each.turn, own)))
-        elif responds(scene, config, each.body):
-            changed[index] += response(config, weights, each, own)
     after = moved(scene, config, state, bodies, changed)
     for body in scene.bodies:
         rows = scene.rows(body.name)

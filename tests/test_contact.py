@@ -258,6 +258,27 @@ def test_a_foot_that_crosses_the_ball_within_a_step_is_seen(scene: Scene) -> Non
     assert float(faster.impact.change[0, struck]) > 0.1
 
 
+def test_links_out_of_reach_do_not_feel_each_other(scene: Scene) -> None:
+    random, count = np.random.default_rng(9), 400
+    state = np.zeros((count, len(scene.links), packed.SIZE))
+    state[..., packed.POSITION] = random.uniform(-0.5, 0.5, (*state.shape[:2], 3)) + (0.0, 0.0, 1.0)
+    state[..., packed.ORIENTATION] = (
+        Rotation.random(state[..., 0].size, rng=random).as_quat().reshape(*state.shape[:2], 4)
+    )
+    free = state.copy()
+    for each in (state, free):
+        speed = random.uniform(0.0, 30.0, (count, 1, 1))
+        each[..., packed.VELOCITY] = speed * random.standard_normal((*state.shape[:2], 3))
+        each[..., packed.ANGULAR_VELOCITY] = 3.0 * speed * random.standard_normal((*state.shape[:2], 3))
+    shape, pair = features.morphology(scene)[None], scene.pairs[0]
+    reach = jax.vmap(lambda one, after: features.within_reach(scene, pair, one[None], after[None], shape))
+    within = np.asarray(jax.jit(reach)(jnp.asarray(state), jnp.asarray(free)))
+    touch = jax.jit(partial(features.contact_inputs, scene, pair))(jnp.asarray(state), jnp.asarray(free), shape)
+    felt = np.asarray(touch.near).max(axis=1) > 0.0
+    assert felt.any() and (~within).any()
+    assert not (felt & ~within).any()
+
+
 def integrated(
     acceleration: float, surface: Surface, depth: float, approach: float, time: float
 ) -> tuple[float, float]:
