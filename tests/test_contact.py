@@ -261,7 +261,7 @@ def test_a_foot_that_crosses_the_ball_within_a_step_is_seen(scene: Scene) -> Non
 def test_links_out_of_reach_do_not_feel_each_other(scene: Scene) -> None:
     random, count = np.random.default_rng(9), 400
     state = np.zeros((count, len(scene.links), packed.SIZE))
-    state[..., packed.POSITION] = random.uniform(-0.5, 0.5, (*state.shape[:2], 3)) + (0.0, 0.0, 1.0)
+    state[..., packed.POSITION] = random.uniform((-0.5, -0.5, 0.5), (0.5, 0.5, 1.5), (*state.shape[:2], 3))
     state[..., packed.ORIENTATION] = (
         Rotation.random(state[..., 0].size, rng=random).as_quat().reshape(*state.shape[:2], 4)
     )
