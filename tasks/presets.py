@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from mpc import CEM, Gradient
 
@@ -12,6 +13,9 @@ from mpc import CEM, Gradient
 AGAIN = 0.2
 CORRECT = CEM(samples=128, rounds=2, elites=16, decay=1.0)
 STAND = CEM(samples=64, rounds=2, elites=12, decay=1.0)
+
+
+Stage = tuple[CEM | Gradient, ...]
 
 
 @dataclass(frozen=True)
@@ -22,12 +26,12 @@ class Preset:
     between two of them. stand: optimisers of the plans that keep the human up after the kick.
     """
 
-    first: tuple[CEM | Gradient, ...]
-    again: tuple[CEM | Gradient, ...]
+    first: Stage
+    again: Stage
     every: int
     verify: tuple[int, int] = (0, 0)
     correct: CEM | Gradient = CORRECT
-    stand: tuple[CEM | Gradient, ...] = (STAND,)
+    stand: Stage = (STAND,)
 
 
 # One population size throughout, because every size is compiled apart.
@@ -58,28 +62,47 @@ def preset_of(name: str) -> Preset:
     return PRESETS[name]
 
 
-def within(preset: Preset, seconds: float, measure: Callable[[Preset], tuple[float, float]]) -> Preset:
+class Seconds(NamedTuple):
+    """What plans take, compilation left out [s]: the first one, a replan, and one that keeps the human up."""
+
+    first: float
+    again: float
+    stand: float
+
+
+def within(preset: Preset, seconds: float, measure: Callable[[Preset], Seconds]) -> Preset:
     """The preset with as many candidates as its first plan can try in `seconds`, and each replan in a fifth of them.
 
-    measure: seconds of a first plan and of a replan with a preset, compilation left out.
+    The plans that keep the human up do not take longer than replans either. measure: what a preset's plans take.
     """
     if not (math.isfinite(seconds) and seconds > 0.0):
         raise ValueError(f"budget is {seconds}, but must be a finite number of seconds > 0")
-    fitting, first, again = preset, 1.0, 1.0
+    fitting, factors = preset, Seconds(1.0, 1.0, 1.0)
     for _ in range(3):
         took = measure(fitting)
-        first, again = first * seconds / took[0], again * AGAIN * seconds / took[1]
-        fitting = scaled(preset, first, again)
+        again = AGAIN * seconds
+        factors = Seconds(
+            factors.first * seconds / took.first,
+            factors.again * again / took.again,
+            min(1.0, factors.stand * again / took.stand),
+        )
+        fitting = scaled(preset, factors)
     return fitting
 
 
-def scaled(preset: Preset, first: float, again: float) -> Preset:
-    """The preset with so many times the candidates in its first plan and in each replan.
+def scaled(preset: Preset, factors: Seconds) -> Preset:
+    """The preset with so many times the candidates in each of its plans.
 
-    Candidates a round and rounds share the factor evenly; what is tried in the truth stays. All rounds keep the same
-    number of elites, because the plans hand them on.
+    Candidates a round and rounds share the factor evenly; what is tried in the truth stays. All rounds of the kick's
+    plans keep the same number of elites, because they hand them on.
     """
-    stages = (preset.first, first), (preset.again, again)
+    kick = ((preset.first, factors.first), (preset.again, factors.again))
+    first, again = _fit(kick)
+    (stand,) = _fit([(preset.stand, factors.stand)])
+    return replace(preset, first=first, again=again, stand=stand)
+
+
+def _fit(stages: Sequence[tuple[Stage, float]]) -> list[Stage]:
     sizes = [_size(each, factor) for stage, factor in stages for each in stage if isinstance(each, CEM)]
     elites = max(2, min(size // 4 for size, _ in sizes))
 
@@ -90,8 +113,7 @@ def scaled(preset: Preset, first: float, again: float) -> Preset:
         samples, rounds = _size(each, factor)
         return replace(each, samples=samples, rounds=rounds, elites=most)
 
-    found = [tuple(fit(each, factor) for each in stage) for stage, factor in stages]
-    return replace(preset, first=found[0], again=found[1])
+    return [tuple(fit(each, factor) for each in stage) for stage, factor in stages]
 
 
 def _size(optimizer: CEM, factor: float) -> tuple[int, int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mpc import CEM, Gradient
-from tasks.presets import PRESETS, Preset, preset_of, scaled, within
+from tasks.presets import PRESETS, Preset, Seconds, preset_of, scaled, within
 
 
 def candidates(stages: tuple[CEM | Gradient, ...]) -> int:
@@ -17,7 +17,7 @@ def candidates(stages: tuple[CEM | Gradient, ...]) -> int:
 @pytest.mark.parametrize("factor", [0.01, 0.3, 1.0, 4.0])
 def test_a_scaled_preset_tries_so_many_times_the_candidates_and_hands_its_elites_on(name: str, factor: float) -> None:
     preset = PRESETS[name]
-    found = scaled(preset, factor, factor)
+    found = scaled(preset, Seconds(factor, factor, factor))
     for before, after in ((preset.first, found.first), (preset.again, found.again)):
         assert candidates(after) == pytest.approx(max(8, factor * candidates(before)), rel=0.35)
     kept = {each.elites for each in (*found.first, *found.again) if isinstance(each, CEM)}
@@ -26,18 +26,19 @@ def test_a_scaled_preset_tries_so_many_times_the_candidates_and_hands_its_elites
 
 @pytest.mark.parametrize("seconds", [0.5, 2.0])
 def test_a_preset_within_a_time_takes_that_time(seconds: float) -> None:
-    def measure(preset: Preset) -> tuple[float, float]:
-        return 0.05 + 2e-3 * candidates(preset.first), 0.01 + 2e-3 * candidates(preset.again)
+    def measure(preset: Preset) -> Seconds:
+        return Seconds(*(0.01 + 2e-3 * candidates(each) for each in (preset.first, preset.again, preset.stand)))
 
-    first, again = measure(within(PRESETS["balanced"], seconds, measure))
-    assert first == pytest.approx(seconds, rel=0.1)
-    assert again == pytest.approx(0.2 * seconds, rel=0.1)
+    found = measure(within(PRESETS["balanced"], seconds, measure))
+    assert found.first == pytest.approx(seconds, rel=0.1)
+    assert found.again == pytest.approx(0.2 * seconds, rel=0.1)
+    assert found.stand <= 0.22 * seconds
 
 
 @pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_budget_that_is_no_time_is_refused(seconds: float) -> None:
     with pytest.raises(ValueError, match="budget"):
-        within(PRESETS["fast"], seconds, lambda preset: (1.0, 1.0))
+        within(PRESETS["fast"], seconds, lambda preset: Seconds(1.0, 1.0, 1.0))
 
 
 def test_an_unknown_preset_lists_the_known_ones() -> None:

@@ -18,8 +18,9 @@ from larp_model.bodies import human_and_ball
 from tasks.benchmarks import report
 from tasks.data import random_roll, random_task
 from tasks.kick import HEIGHT, WEIGHTS, Kick, Models, models_of, planners_of, prepare, remember_compilations, run
-from tasks.presets import Preset, preset_of, within
+from tasks.presets import Preset, Seconds, preset_of, within
 from tasks.sensing import noisy
+from tasks.standing import Standing
 
 WITHIN = (0.1, 0.25, 0.5)
 
@@ -46,15 +47,20 @@ def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def seconds_of(kick: Kick, models: Models, preset: Preset) -> tuple[float, float]:
-    """Time of a first plan and of a replan [s], compilation left out."""
+def seconds_of(kick: Kick, models: Models, preset: Preset) -> Seconds:
+    """What the preset's plans take, whole windows of them."""
     planners = planners_of(kick, preset, models)
-    window = kick.window(np.array([4.0, 0.0, 0.5]))(0)
-    plan, took = planners.first.init(jax.random.key(0)), []
-    for planner in (planners.first, planners.again):
-        runs = [planner.step(plan, kick.start(), window.controls, window.context)[1].seconds for _ in range(2)]
+    took = []
+    for planner, window, links in (
+        (planners.first, kick.window(np.array([4.0, 0.0, 0.5])), slice(None)),
+        (planners.again, kick.window(np.array([4.0, 0.0, 0.5])), slice(None)),
+        (planners.stand, Standing(kick.scene, kick.reference).window, kick.human),
+    ):
+        plan, (controls, context, steps) = planner.init(jax.random.key(0)), window(0)
+        state = kick.start()[links]
+        runs = [planner.step(plan, state, controls, context, steps=steps)[1].seconds for _ in range(2)]
         took.append(min(runs))
-    return took[0], took[1]
+    return Seconds(*took)
 
 
 def picture(rows: list[dict[str, Any]], title: str) -> Figure:
