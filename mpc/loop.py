@@ -42,8 +42,9 @@ class Phase(NamedTuple):
     """A part of an execution: who plans in it, and for what.
 
     first: the planner of its first plan; again: of all later ones, every `every` steps. Both share horizon, knots and
-    elites. window: what is wanted from a step on. over: whether, in a step with a state (L, 13), the next phase begins
-    or, after the last, planning ends. links: those that the planners' dynamics know.
+    elites. window: what is wanted from a step on. over: whether, in a step with a state (L, 13), the phase comes to its
+    end: for `linger` steps its plan is carried on, then the next phase begins or, after the last, planning ends. links:
+    those that the planners' dynamics know.
     """
 
     first: Planner
@@ -51,6 +52,7 @@ class Phase(NamedTuple):
     every: int
     window: Callable[[int], Window]
     over: Callable[[int, np.ndarray], bool] = never
+    linger: int = 0
     links: slice = slice(None)
 
 
@@ -91,12 +93,17 @@ def execute(
     world.reset(state[None])
     execution = Execution([np.asarray(state)])
     index, plan, planned_at, targets = 0, None, 0, np.zeros(0)
+    ends: int | None = None
     for step in range(steps):
         current = sense(execution.states[-1])
-        while index < len(phases) and phases[index].over(step, current):
-            index, plan = index + 1, None
+        while index < len(phases):
+            if ends is None and phases[index].over(step, current):
+                ends = step + phases[index].linger
+            if ends is None or step < ends:
+                break
+            index, plan, ends = index + 1, None, None
         phase = phases[min(index, len(phases) - 1)]
-        if index < len(phases) and (plan is None or step - planned_at >= phase.every):
+        if index < len(phases) and (plan is None or (ends is None and step - planned_at >= phase.every)):
             planner = phase.first if plan is None else phase.again
             before = planner.init(jax.random.fold_in(key, index), step * dt) if plan is None else plan
             wanted = phase.window(step)

@@ -60,6 +60,8 @@ from viewer import LivePage, Recording, kick_picture, nearest_approach, write_ht
 
 # Steps that a plan looks beyond the reference's strike with the whole scene, and then with the ball alone.
 BEYOND, FLIGHT = 15, 120
+# Steps for which a plan is carried on once the ball has been touched: for as long as it may be pushed.
+LINGER = 6
 # A plan looks at least so many steps ahead, even when the strike is overdue.
 SHORTEST = 15
 # Spread of a first plan, as a share of how far the training data strays from the reference.
@@ -223,7 +225,7 @@ class Kick:
             Truth(self.scene, threads=1),
             state,
             (
-                Phase(first, again, every, self.window(target), touched),
+                Phase(first, again, every, self.window(target), touched, LINGER),
                 Phase(stand, stand, STAND_EVERY, Standing(self.scene, self.reference).window, links=self.human),
             ),
             steps,

@@ -62,7 +62,7 @@ def test_each_phase_plans_with_its_own_planners_for_its_own_links_until_it_is_ov
     one, other = _planner(), _planner()
     phases = (
         Phase(one, one, 2, _window, lambda step, state: step == 5),
-        Phase(other, other, 3, _window, lambda step, state: step == 12, slice(0, 1)),
+        Phase(other, other, 3, _window, lambda step, state: step == 12, links=slice(0, 1)),
     )
     world = World()
     execution = execute(world, START, phases, 20, jax.random.key(0), DT)
@@ -74,6 +74,19 @@ def test_each_phase_plans_with_its_own_planners_for_its_own_links_until_it_is_ov
     # The last plan is carried out, and then the reference.
     assert np.abs(world.given[11:16]).max() > 0.0
     np.testing.assert_array_equal(world.given[11 + HORIZON :], np.zeros((20 - 11 - HORIZON, 1, 3)))
+
+
+def test_a_phase_that_lingers_carries_its_plan_on_before_the_next_begins() -> None:
+    one, other = _planner(), _planner()
+    phases = (
+        Phase(one, one, 2, _window, lambda step, state: step == 5, linger=3),
+        Phase(other, other, 3, _window),
+    )
+    world = World()
+    execution = execute(world, START, phases, 12, jax.random.key(0), DT)
+    assert [(replan.step, replan.phase) for replan in execution.replans] == [(0, 0), (2, 0), (4, 0), (8, 1), (11, 1)]
+    last = execution.replans[2].plan
+    np.testing.assert_array_equal(world.given[4:8], one.controls(last, np.zeros((HORIZON, 1, 3)))[:4])
 
 
 def test_planners_see_what_is_sensed_and_the_truth_goes_on_from_the_truth() -> None:
