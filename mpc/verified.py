@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -59,31 +61,48 @@ class Verified:
 
         last: knots (K, J, 3) of the plan carried on. score: costs in the planner's own dynamics, corrected.
         """
-        count, history = self.candidates, []
+        count = self.candidates
         elites = jnp.concatenate([search.elites[: count - 1], last[None], search.elites[count - 1 : -1]])
-        search, best, lowest = search._replace(elites=elites), last, jnp.float32(jnp.inf)
-        _, wanted = jax.tree.map(lambda leaf: leaf[0], trial(None, last[None]))
-        for number, phase in enumerate(jax.random.split(key, self.rounds)):
+        _, believed = trial(None, last[None])
+        best = Best(last, jnp.float32(jnp.inf), _first(believed))
+
+        def try_them(search: Search, best: Best) -> tuple[Search, Best, jax.Array]:
             costs, residuals = trial(self.dynamics, search.elites[:count])
-            history.append(costs)
             first = jnp.argmin(costs)
-            won = costs[first] < lowest
-            best, lowest = jnp.where(won, search.elites[first], best), jnp.where(won, costs[first], lowest)
-            wanted = jax.tree.map(lambda new, old: jnp.where(won, new[first], old), residuals, wanted)  # noqa: B023
-            search = _ranked(search, best, lowest, costs)
-            if number == self.rounds - 1:
-                break
-            _, believed = trial(None, best[None])
-            corrections = jax.tree.map(lambda true, mine: true - mine[0], wanted, believed)
-            search = search._replace(mean=best, costs=jnp.full(len(search.costs), jnp.inf))
-            search, tried = self.optimizer.improve(search, phase, score(corrections))
-            history.extend(tried)
-        return search, history
+            found = Best(search.elites[first], costs[first], jax.tree.map(lambda leaf: leaf[first], residuals))
+            best = jax.tree.map(partial(jnp.where, found.cost < best.cost), found, best)
+            return _ranked(search, best, costs), best, costs
+
+        def one_round(carry: tuple[Search, Best], key: jax.Array) -> tuple[tuple[Search, Best], list[jax.Array]]:
+            search, best, costs = try_them(*carry)
+            _, believed = trial(None, best.knots[None])
+            corrections = jax.tree.map(lambda true, mine: true - mine, best.residuals, _first(believed))
+            search = search._replace(mean=best.knots, costs=jnp.full(len(search.costs), jnp.inf))
+            search, tried = self.optimizer.improve(search, key, score(corrections))
+            return (search, best), [costs, *tried]
+
+        start = search._replace(elites=elites), best
+        # A scan, because every round would be compiled apart.
+        (search, best), rounds = jax.lax.scan(one_round, start, jax.random.split(key, self.rounds - 1))
+        search, _, costs = try_them(search, best)
+        return search, [*(each for column in rounds for each in column), costs]
 
 
-def _ranked(search: Search, best: jax.Array, lowest: jax.Array, costs: jax.Array) -> Search:
+class Best(NamedTuple):
+    """The cheapest candidate tried so far: knots (K, J, 3) [rad], its cost () and its residuals."""
+
+    knots: jax.Array
+    cost: jax.Array
+    residuals: Residuals
+
+
+def _first(residuals: Residuals) -> Residuals:
+    return jax.tree.map(lambda leaf: leaf[0], residuals)
+
+
+def _ranked(search: Search, best: Best, costs: jax.Array) -> Search:
     """The search with its first elites in the order of their costs (N,), the best of all before them."""
     count = len(costs)
     tried, costs = best_first(search.elites[:count], costs, count)
-    elites = jnp.concatenate([best[None], tried[:-1], search.elites[count:]])
-    return search._replace(elites=elites, costs=jnp.concatenate([lowest[None], costs[:-1], search.costs[count:]]))
+    elites = jnp.concatenate([best.knots[None], tried[:-1], search.elites[count:]])
+    return search._replace(elites=elites, costs=jnp.concatenate([best.cost[None], costs[:-1], search.costs[count:]]))
