@@ -59,14 +59,14 @@ IMPACTS = replace(
 # Within a step of an impact a foot that is 2 mm off is off by 0.2 m/s: places and turns count as the speeds they are.
 # The contact's own networks would pay for that with the ball's velocity, and are not trained with it.
 PRECISE = LOSS._replace(position=100.0, rotation=16.0, far=1e-3)
-RESPONSES = replace(IMPACTS, updates=10000, only=RESPONSE, loss=PRECISE)
+RESPONSES = replace(IMPACTS, updates=8000, only=RESPONSE, loss=PRECISE)
 STAGES = (
     Stage("steps", "", STEPS),
     Stage("rollouts", "", ROLLOUTS),
     Stage("planned1", "planned", AGAIN),
     Stage("impacts1", "contacts", IMPACTS),
     Stage("planned2", "planned", SWING),
-    Stage("impacts2", "contacts", replace(IMPACTS, updates=20000)),
+    Stage("impacts2", "contacts", replace(IMPACTS, updates=14000)),
     Stage("responses", "", RESPONSES),
 )
 
