@@ -8,7 +8,6 @@ PYTHON ?= $(shell for python in python3 python3.11 python3.12 python3.13; do \
 	$$python -c '$(RECENT)' 2>/dev/null && echo $$python && exit; done; echo python3)
 RUN := .venv/bin/python -m
 READY := .venv/ready
-RESULTS := runs/benchmarks
 
 .PHONY: setup test lint kick view train bench clean
 
@@ -40,11 +39,19 @@ view: $(READY)
 train: $(READY)
 	@$(RUN) tasks.train
 
+KICK := $(RUN) tasks.benchmarks.kick --seed 7
+
 bench: $(READY)
-	@mkdir -p $(RESULTS)
-	$(RUN) tasks.benchmarks.kick --targets 16 --seed 0 --preset balanced --dynamics larp --json $(RESULTS)/kick_larp.json
-	$(RUN) tasks.benchmarks.kick --targets 16 --seed 0 --preset balanced --dynamics mujoco --json $(RESULTS)/kick_mujoco.json
-	$(RUN) tasks.benchmarks.model --scene human_ball --sequences 256 --seed 1 --json $(RESULTS)/model_human_ball.json
+	$(RUN) tasks.benchmarks.model --scene human_ball --sequences 256 --seed 1
+	$(RUN) tasks.benchmarks.gap --targets 8 --seed 7
+	for preset in fast balanced accurate; do $(KICK) --targets 64 --preset $$preset || exit; done
+	for seconds in 1 5; do $(KICK) --preset balanced --dynamics mujoco --budget $$seconds || exit; done
+	$(KICK) --preset balanced --budget 1
+	$(KICK) --preset accurate --budget 5
+	$(KICK) --preset accurate --noise
+	$(KICK) --targets 32 --noise
+	$(KICK) --targets 32 --rolling 2
+	for height in 1.6 1.9; do $(KICK) --height $$height || exit; done
 
 # Keeps runs/: results are never thrown away by a clean-up.
 clean:

@@ -18,6 +18,14 @@ Trial = Callable[[Dynamics | None, jax.Array], tuple[jax.Array, Residuals]]
 """Costs (N,) and residuals (N, ...) of knots (N, K, J, 3) in these dynamics; None: in the planner's own."""
 
 
+class Best(NamedTuple):
+    """The cheapest candidate tried so far: knots (K, J, 3) [rad], its cost () and its residuals."""
+
+    knots: jax.Array
+    cost: jax.Array
+    residuals: Residuals
+
+
 @dataclass(frozen=True)
 class Verified:
     """The planner's own dynamics propose, truer ones decide, and their verdict corrects the next proposal.
@@ -28,8 +36,8 @@ class Verified:
         r(theta) = r_model(theta) + r_true(theta*) - r_model(theta*)
 
     So a model that errs much alike for neighbouring candidates finds a plan that is good in truth after a few trials,
-    as an archer corrects the aim by the last miss (additive correction of a surrogate: Alexandrov et al. 2001,
-    "Approximation and model management").
+    as an archer corrects the aim by the last miss (model management of order zero: N. Alexandrov and R. Lewis, "An
+    Overview of First-Order Model Management for Engineering Optimization", 2001).
     """
 
     dynamics: Dynamics
@@ -86,14 +94,6 @@ class Verified:
         (search, best), rounds = jax.lax.scan(one_round, start, jax.random.split(key, self.rounds - 1))
         search, _, costs = try_them(search, best)
         return search, [*(each for column in rounds for each in column), costs]
-
-
-class Best(NamedTuple):
-    """The cheapest candidate tried so far: knots (K, J, 3) [rad], its cost () and its residuals."""
-
-    knots: jax.Array
-    cost: jax.Array
-    residuals: Residuals
 
 
 def _first(residuals: Residuals) -> Residuals:
