@@ -73,8 +73,8 @@ REACHABLE = 0.25
 WEIGHTS = "human_ball"
 # Of the human whom the shipped weights know [m, kg].
 HEIGHT, MASS = 1.75, 70.0
-# Rows that MuJoCo, as the planner's model, rolls out side by side; candidates that are tried in it at a time.
-ROWS, TRIED = 32, 8
+# Candidates that MuJoCo rolls out side by side: few, for a small budget's sake.
+ROWS = 8
 
 Pair = np.ndarray | tuple[float, float]
 DynamicsName = Literal["larp", "mujoco"]
@@ -283,18 +283,16 @@ def miss(path: np.ndarray, target: np.ndarray) -> float:
     return nearest_approach(path, target).distance
 
 
-def models_of(
-    scene: Scene, name: DynamicsName, weights: Path, trained_on: Scene | None = None, rows: int = ROWS
-) -> Models:
+def models_of(scene: Scene, name: DynamicsName, weights: Path, trained_on: Scene | None = None) -> Models:
     """The planners' models; that of the scene goes on with the ball alone once no link can reach it any more.
 
-    trained_on: the scene of the weights, where that is another one. rows: that MuJoCo rolls out side by side.
+    trained_on: the scene of the weights, where that is another one.
     """
     human, ball = scene.bodies[0].name, scene.bodies[-1].name
 
     def model(*bodies: str) -> Dynamics:
         part = scene.only(*bodies)
-        return MujocoDynamics(Truth(part, rows)) if name == "mujoco" else Simulator(part, config, learned)
+        return MujocoDynamics(Truth(part, ROWS)) if name == "mujoco" else Simulator(part, config, learned)
 
     if name == "larp":
         config, learned, manifest = stored.load(weights, trained_on or scene)
@@ -312,9 +310,9 @@ def planners_of(kick: Kick, preset: Preset, models: Models) -> Planners:
     first: tuple[Optimizer, ...] = preset.first
     again: tuple[Optimizer, ...] = preset.again
     if any(preset.verify) and models.learned:
-        truth = models_of(kick.scene, "mujoco", Path(), rows=TRIED).whole
+        truth = models_of(kick.scene, "mujoco", Path()).whole
         first, again = (
-            (*proposing, Verified(truth, preset.correct, rounds, TRIED)) if rounds else proposing
+            (*proposing, Verified(truth, preset.correct, rounds, ROWS)) if rounds else proposing
             for proposing, rounds in zip((first, again), preset.verify, strict=True)
         )
     return Planners(
