@@ -18,6 +18,7 @@ import json
 import os
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -50,7 +51,7 @@ from mpc import (
 )
 from mpc.loop import Execution, Phase, Replan, Window, execute
 from mpc.planner import Optimizer
-from tasks import references
+from tasks import references, residuals
 from tasks.data import stray
 from tasks.gap import contact_step, gap, told
 from tasks.presets import Preset, preset_of
@@ -120,17 +121,6 @@ class Kick:
             nearest, _ = nearest_on_path(states[:, self.ball, packed.POSITION], context["target"])
             return nearest - context["target"]
 
-        def near_reference(states: Array, controls: Array, context: Any) -> Array:
-            links = states[: len(controls), self.human, packed.POSITION]
-            links = links - links[:, :1]
-            return ((links - context["reference"]) * context["until_strike"][:, None, None]).reshape(len(controls), -1)
-
-        def effort(states: Array, controls: Array, context: Any) -> Array:
-            return (controls - context["controls"]).reshape(len(controls), -1)
-
-        def upright(states: Array, controls: Array, context: Any) -> Array:
-            return jnp.maximum(0.85 * self.standing - states[: len(controls), 0, 2:3], 0.0)
-
         def find_ball(states: Array, controls: Array, context: Any) -> Array:
             apart = (
                 states[: len(controls), self.foot, packed.POSITION]
@@ -140,9 +130,9 @@ class Kick:
 
         return (
             CostTerm("target", target, l2(0.05), 10.0),
-            CostTerm("reference", near_reference, quadratic, 20.0),
-            CostTerm("effort", effort, quadratic, 0.5),
-            CostTerm("upright", upright, quadratic, 20.0),
+            CostTerm("reference", partial(residuals.pose, human=self.human), quadratic, 20.0),
+            CostTerm("effort", residuals.effort, quadratic, 0.5),
+            CostTerm("upright", residuals.upright, quadratic, 20.0),
             CostTerm("find_ball", find_ball, quadratic, 5.0),
         )
 
@@ -152,13 +142,13 @@ class Kick:
         def at(step: int) -> Window:
             states, controls = self.reference.window(step, self.horizon)
             links = states[:, self.human, packed.POSITION]
+            ahead = np.arange(step + 1, step + 1 + self.horizon)
             context = {
                 "target": np.asarray(target, float),
                 "reference": links - links[:, :1],
+                "counted": (ahead <= self.reference.strike + 5).astype(float),
+                "height": np.float64(0.85 * self.standing),
                 "controls": controls,
-                "until_strike": (np.arange(step + 1, step + 1 + self.horizon) <= self.reference.strike + 5).astype(
-                    float
-                ),
             }
             return Window(controls, context, int(np.clip(self.horizon - step, SHORTEST, self.horizon)))
 

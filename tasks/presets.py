@@ -14,7 +14,6 @@ AGAIN = 0.2
 CORRECT = CEM(samples=128, rounds=2, elites=16, decay=1.0)
 STAND = CEM(samples=64, rounds=2, elites=12, decay=1.0)
 
-
 Stage = tuple[CEM | Gradient, ...]
 
 

@@ -122,7 +122,7 @@ def captured(path: str | Path, scene: Scene, seconds_before: float = 0.6, second
     expected, last = round(bvh.strike(clip) / clip.rate / scene.dt), len(controls) - 1
     tracker = Tracker(scene, wanted, _importance(scene, len(wanted), expected), controls)
     before, targets = tracker.follow(wanted[0], 0, min(expected + MEETING, last))
-    spot, touch = _spot(scene, before, expected)
+    spot, touch = _spot(path, scene, before, expected)
     before[:, -1, packed.POSITION] = spot
     after, onwards = tracker.follow(before[touch], touch, last)
     states = np.concatenate([before[:touch], after])
@@ -183,27 +183,27 @@ def _importance(scene: Scene, steps: int, strike: int) -> np.ndarray:
     return weights
 
 
-def _spot(scene: Scene, states: np.ndarray, strike: int) -> tuple[np.ndarray, int]:
+def _spot(path: str | Path, scene: Scene, states: np.ndarray, strike: int) -> tuple[np.ndarray, int]:
     """Where a ball (3,) [m] just touches the right foot, ahead of its middle, and in which step near the strike."""
     human, radius = scene.bodies[0], scene.bodies[-1].links[0].radius
     foot = human.links[human.link("right_foot")]
-    path = states[:, scene.index(human.name, "right_foot")]
-    height = path[:, 2] - radius
-    speed = np.linalg.norm(path[:, packed.VELOCITY][:, :2], axis=-1)
+    way = states[:, scene.index(human.name, "right_foot")]
+    height = way[:, 2] - radius
+    speed = np.linalg.norm(way[:, packed.VELOCITY][:, :2], axis=-1)
     reach = radius + foot.radius
     # The foot pushes along the line of centres, which its height tilts out of the horizontal.
     push = speed * np.sqrt(np.maximum(1.0 - (height / reach) ** 2, 0.0))
-    push[abs(np.arange(len(path)) - strike) > MEETING] = 0.0
+    push[abs(np.arange(len(way)) - strike) > MEETING] = 0.0
     touch = int(push.argmax())
     if not push[touch] > 0.0:
-        raise ValueError(f"path: its kick passes {height[strike]:.2f} m above the centre of a ball, and finds none")
+        raise ValueError(f"{path}: the foot passes {height[strike]:.2f} m above the centre of a ball, and hits none")
 
-    forwards = np.array([*path[touch, packed.VELOCITY][:2], 0.0]) / speed[touch]
-    turn = Rotation.from_quat(path[touch, packed.ORIENTATION], scalar_first=True)
+    forwards = np.array([*way[touch, packed.VELOCITY][:2], 0.0]) / speed[touch]
+    turn = Rotation.from_quat(way[touch, packed.ORIENTATION], scalar_first=True)
     along = np.linspace(-0.5, 0.5, 21)[:, None] * foot.length * turn.apply(foot.axis)
     # Points of the foot's axis, from the ball's centre below them; moved ahead, it is out of reach of all of them.
     apart = along + np.array([0.0, 0.0, height[touch]])
     ahead = apart @ forwards
     aside = np.sum(apart**2, axis=-1) - ahead**2
     distance = np.max(ahead + np.sqrt(np.maximum(reach**2 - aside, 0.0)), where=aside < reach**2, initial=0.0)
-    return np.array([*(path[touch, :2] + distance * forwards[:2]), radius]), touch
+    return np.array([*(way[touch, :2] + distance * forwards[:2]), radius]), touch

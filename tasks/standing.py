@@ -22,6 +22,7 @@ from larp_model.bodies import standing_height
 from larp_model.scene import Scene
 from mpc import CEM, CostTerm, Dynamics, Gradient, Planner, quadratic
 from mpc.loop import Window
+from tasks import residuals
 from tasks.data import stray
 from tasks.references import Reference
 
@@ -56,21 +57,11 @@ class Standing:
         def balance(states: Array, controls: Array, context: Any) -> Array:
             return self.capture_point(states) - context["capture_point"]
 
-        def near_reference(states: Array, controls: Array, context: Any) -> Array:
-            links = packed.position(states)
-            return (links - links[:, :1] - context["reference"]).reshape(len(controls), -1)
-
-        def upright(states: Array, controls: Array, context: Any) -> Array:
-            return jnp.maximum(context["height"] - states[:, 0, 2:3], 0.0)
-
-        def effort(states: Array, controls: Array, context: Any) -> Array:
-            return (controls - context["controls"]).reshape(len(controls), -1)
-
         return (
             CostTerm("balance", balance, quadratic, 100.0),
-            CostTerm("reference", near_reference, quadratic, 20.0),
-            CostTerm("upright", upright, quadratic, 100.0),
-            CostTerm("effort", effort, quadratic, 0.2),
+            CostTerm("reference", residuals.pose, quadratic, 20.0),
+            CostTerm("upright", residuals.upright, quadratic, 100.0),
+            CostTerm("effort", residuals.effort, quadratic, 0.2),
         )
 
     def window(self, step: int) -> Window:
@@ -81,6 +72,7 @@ class Standing:
         context = {
             "capture_point": np.asarray(self.capture_point(jnp.asarray(human))),
             "reference": links - links[:, :1],
+            "counted": np.ones(HORIZON),
             "height": 0.98 * human[:, 0, 2:3],
             "controls": controls,
         }

@@ -32,6 +32,8 @@ from tasks.presets import preset_of
 
 # A candidate is one of the plan's elites, moved by this share of the spread of a first plan.
 AROUND = 0.1
+# Colours of the first, the middle and the last plan.
+MARKS = ("#0072b2", "#e69f00", "#d55e00")
 
 
 def candidates_of(
@@ -104,9 +106,6 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
     axes.set(xscale="log", yscale="log", xlabel="cost in the model", ylabel="cost in MuJoCo")
     axes.legend(frameon=False)
     return figure
-
-
-MARKS = ("#0072b2", "#e69f00", "#d55e00")
 
 
 def main(

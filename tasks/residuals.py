@@ -1,0 +1,31 @@
+"""Residuals that the kick and the standing after it share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+
+from larp_model import state as packed
+
+
+def pose(states: Array, controls: Array, context: Any, human: slice = slice(None)) -> Array:
+    """(H, 3 n) how far the human's links, seen from the pelvis, are from the reference's [m].
+
+    context: `reference` (H, n, 3) [m], and `counted` (H,), the share to which each step counts. human: rows of its n
+    links in states (H', L, 13).
+    """
+    links = packed.position(states[: len(controls), human])
+    apart = links - links[:, :1] - context["reference"]
+    return (apart * context["counted"][:, None, None]).reshape(len(controls), -1)
+
+
+def effort(states: Array, controls: Array, context: Any) -> Array:
+    """(H, 3 J) how far joint targets (H, J, 3) are from the reference's, `controls` (H, J, 3) [rad] of the context."""
+    return (controls - context["controls"]).reshape(len(controls), -1)
+
+
+def upright(states: Array, controls: Array, context: Any) -> Array:
+    """(H, 1) how far the pelvis, row 0, is below `height` [m] of the context."""
+    return jnp.maximum(context["height"] - states[: len(controls), 0, 2:3], 0.0)
