@@ -425,6 +425,7 @@ def main(
     planners = planners_of(kick, chosen, models)
     page = LivePage(port=port) if view else None
     if page:
+        Console().print(f"Watch it at {page.address} (Ctrl-C ends)")
         page.begin(kick.scene, goal)
 
     def observe(execution: Execution) -> None:
