@@ -23,9 +23,9 @@ from larp_model.scene import Body, Pair, Scene
 
 # Solid spheres: moment of inertia / (mass x radius^2).
 SPHERE = 0.4
-# Bounds of what the networks may add, so that no state, however odd, is thrown out of the world.
 # Impulse [N s] from which a body's response is heard in full.
 FELT = 0.2
+# Bounds of what the networks may add, so that no state, however odd, is thrown out of the world.
 # Contact: share of the free impact, normal speed [m/s], slide, binormal, upward speed [m/s], lag [ms].
 CONTACT_BOUNDS = (1.0, 3.0, 1.0, 1.0, 3.0, 5.0)
 # Ball on the ground: share of the free bounce, speed [m/s], stick, drag, grip, roll, twist, lag [ms].
