@@ -53,6 +53,7 @@ ORDER = [
     "tasks.tracking",
     "tasks.references",
     "tasks.data",
+    "tasks.residuals",
     "tasks.standing",
     "tasks.sensing",
     "tasks.gap",
