@@ -158,7 +158,7 @@ def main(
     command = (
         f"python -m tasks.benchmarks.kick --targets {targets} --seed {seed} --preset {preset} --dynamics {dynamics}"
     )
-    flags = {"reference": f"--reference {reference}", "noise": "--noise"}
+    flags = {"reference": f"--reference {reference.name if reference else ''}", "noise": "--noise"}
     command = " ".join([command, *(flags.get(option, f"--{option} {value}") for option, value in said.items())])
     title = ", ".join([f"Kick: {preset}", dynamics, *(f"{option} {value}" for option, value in said.items())])
     report.write_json(json, {"command": command, "hardware": report.hardware(), **figures, "rows": rows})
