@@ -48,7 +48,7 @@ bench: $(READY)
 	for seconds in 1 5; do $(KICK) --preset balanced --dynamics mujoco --budget $$seconds || exit; done
 	$(KICK) --preset balanced --budget 1
 	$(KICK) --preset accurate --budget 5
-	$(KICK) --preset accurate --noise
+	$(KICK) --targets 8 --preset accurate --noise
 	$(KICK) --targets 32 --noise
 	$(KICK) --targets 32 --rolling 2
 	for height in 1.6 1.9; do $(KICK) --height $$height || exit; done
