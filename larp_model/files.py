@@ -30,3 +30,12 @@ def write_whole(path: str | Path, data: bytes) -> None:
     """Write data to a file."""
     with written_whole(path) as file:
         file.write(data)
+
+
+def require_writable(folder: str | Path, argument: str) -> None:
+    """Refuses, under the argument's name, a folder that is not there and cannot be made, or cannot be written."""
+    nearest = Path(folder).absolute()
+    while not nearest.exists():
+        nearest = nearest.parent
+    if not (nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK)):
+        raise ValueError(f"{argument} needs the folder {str(folder)!r}, but {str(nearest)!r} cannot be written to")

@@ -33,10 +33,10 @@ from rich.table import Table
 from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.bodies import human_and_ball, standing_height
-from larp_model.files import write_whole
+from larp_model.files import require_writable, write_whole
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
-from larp_model.truth.mujoco import Truth
+from larp_model.truth.mujoco import FINE_SUBSTEPS, SUBSTEPS, Truth
 from mpc import (
     Continued,
     CostTerm,
@@ -102,9 +102,9 @@ class Planners(NamedTuple):
 class Kick:
     """The kick task on one scene and reference: terms, windows, planners, execution and its report."""
 
-    def __init__(self, scene: Scene, reference: Reference) -> None:
-        """scene: its first body is the human, its last the ball."""
-        self.scene, self.reference = scene, reference
+    def __init__(self, scene: Scene, reference: Reference, substeps: int = FINE_SUBSTEPS) -> None:
+        """scene: its first body is the human, its last the ball. substeps: engine steps of the truth in a step."""
+        self.scene, self.reference, self.substeps = scene, reference, substeps
         self.human = scene.rows(scene.bodies[0].name)
         self.ball = len(scene.links) - 1
         self.foot = scene.index(scene.bodies[0].name, "right_foot")
@@ -186,7 +186,7 @@ class Kick:
 
     def untouched(self, state: np.ndarray, steps: int) -> np.ndarray:
         """The ball's states (steps + 1, 13) from a state (L, 13) on, if nothing but the ground touched it."""
-        truth = Truth(self.scene.only(self.scene.bodies[-1].name), threads=1)
+        truth = Truth(self.scene.only(self.scene.bodies[-1].name), 1, self.substeps, threads=1)
         alone = state[None, self.ball :]
         after, _ = truth.rollout(alone, np.zeros((1, steps, 0, 3)))
         return np.concatenate([alone[0], after[0][:, 0]])
@@ -212,7 +212,7 @@ class Kick:
 
         first, again, every, stand = planners
         return execute(
-            Truth(self.scene, threads=1),
+            Truth(self.scene, 1, self.substeps, threads=1),
             state,
             (
                 Phase(first, again, every, self.window(target), touched, LINGER),
@@ -240,19 +240,20 @@ class Kick:
         states = np.stack(execution.states)
         free = self.untouched(states[0], len(states) - 1)[:, packed.VELOCITY]
         contact = contact_step(states, free)
-        begin = 0 if contact is None else max(contact - 1, 0)
-        end = len(states) if contact is None else min(contact + AFTER_CONTACT + 1, len(states))
+        begin, end = after_contact(contact, len(states))
         plans = self.plans(execution)
         last = plans[-1]
         links = states[: begin + 1, self.human, packed.POSITION]
         wanted = self.reference.states[: begin + 1, self.human, packed.POSITION]
         apart = np.linalg.norm((links - links[:, :1]) - (wanted - wanted[:, :1]), axis=-1)
+        truth_error = miss(states[begin:end, self.ball, packed.POSITION], target)
         model_error = miss(last.info.states[:, self.ball, packed.POSITION], target)
         seconds = [replan.info.seconds for replan in plans]
         again = 1e3 * np.array(seconds[1:] or seconds)
         return {
             "target": [float(x) for x in target],
-            "truth_error_m": miss(states[begin:end, self.ball, packed.POSITION], target),
+            "truth_error_m": truth_error,
+            "limit_error_m": truth_error if self.substeps == FINE_SUBSTEPS else self.replayed(execution, target),
             "model_error_m": model_error,
             "reference_deviation_m": float(apart.mean()),
             "ball_speed_m_s": float(np.linalg.norm(states[begin:end, self.ball, packed.VELOCITY], axis=-1).max()),
@@ -268,21 +269,38 @@ class Kick:
         }
 
 
+    def replayed(self, execution: Execution, target: np.ndarray, substeps: int = FINE_SUBSTEPS) -> float:
+        """The miss [m] of the executed controls, replayed from the start in the truth at another step."""
+        start, controls = execution.states[0], np.stack(execution.controls)
+        after, _ = Truth(self.scene, 1, substeps, threads=1).rollout(start[None], controls[None])
+        states = np.concatenate([start[None], after[0]])
+        free = self.untouched(start, len(controls))[:, packed.VELOCITY]
+        begin, end = after_contact(contact_step(states, free), len(states))
+        return miss(states[begin:end, self.ball, packed.POSITION], target)
+
+
+def after_contact(contact: int | None, count: int) -> tuple[int, int]:
+    """Which of `count` states count for the miss: from first contact, if any, to 2 s after it."""
+    return (0, count) if contact is None else (max(contact - 1, 0), min(contact + AFTER_CONTACT + 1, count))
+
+
 def miss(path: np.ndarray, target: np.ndarray) -> float:
     """Smallest distance [m] of the ball's path (T, 3) from the target (3,)."""
     return nearest_approach(path, target).distance
 
 
-def models_of(scene: Scene, name: DynamicsName, weights: Path, trained_on: Scene | None = None) -> Models:
+def models_of(
+    scene: Scene, name: DynamicsName, weights: Path, trained_on: Scene | None = None, substeps: int = SUBSTEPS
+) -> Models:
     """The planners' models; that of the scene goes on with the ball alone once no link can reach it any more.
 
-    trained_on: the scene of the weights, where that is another one.
+    trained_on: the scene of the weights, where that is another one. substeps: engine steps in a step of MuJoCo.
     """
     human, ball = scene.bodies[0].name, scene.bodies[-1].name
 
     def model(*bodies: str) -> Dynamics:
         part = scene.only(*bodies)
-        return MujocoDynamics(Truth(part, ROWS)) if name == "mujoco" else Simulator(part, config, learned)
+        return MujocoDynamics(Truth(part, ROWS, substeps)) if name == "mujoco" else Simulator(part, config, learned)
 
     if name == "larp":
         config, learned, manifest = stored.load(weights, trained_on or scene)
@@ -300,7 +318,7 @@ def planners_of(kick: Kick, preset: Preset, models: Models) -> Planners:
     first: tuple[Optimizer, ...] = preset.first
     again: tuple[Optimizer, ...] = preset.again
     if any(preset.verify) and models.learned:
-        truth = models_of(kick.scene, "mujoco", Path()).whole
+        truth = models_of(kick.scene, "mujoco", Path(), substeps=kick.substeps).whole
         first, again = (
             (*proposing, Verified(truth, preset.correct, rounds, ROWS)) if rounds else proposing
             for proposing, rounds in zip((first, again), preset.verify, strict=True)
@@ -381,14 +399,14 @@ def table(summary: dict[str, Any]) -> Table:
     return rows
 
 
-def prepare(body_reference: Path | None = None, height: float = HEIGHT) -> Kick:
+def prepare(body_reference: Path | None = None, height: float = HEIGHT, substeps: int = FINE_SUBSTEPS) -> Kick:
     """The kick's scene with its reference: the embedded one, or a captured one from a BVH file.
 
-    height: of the human [m].
+    height: of the human [m]. substeps: engine steps of the truth in a step.
     """
     scene = human_and_ball(height=height, mass=MASS * (height / HEIGHT) ** 2)
     reference = references.embedded(scene) if body_reference is None else references.captured(body_reference, scene)
-    return Kick(scene, reference)
+    return Kick(scene, reference, substeps)
 
 
 def main(
@@ -419,6 +437,7 @@ def main(
     if reference is not None and not reference.is_file():
         raise ValueError(f"reference is {str(reference)!r}, but no such file exists")
     chosen = preset_of(preset)
+    require_writable(out, "out")
     remember_compilations()
     kick = prepare(reference)
     models = models_of(kick.scene, dynamics, weights)  # type: ignore[arg-type]

@@ -286,7 +286,12 @@ def test_benchmark_compares_clips_with_the_embedded_kick(tmp_path: Path, monkeyp
         benchmark.main(clips=tmp_path)
     assert not list(tmp_path.iterdir())
     (tmp_path / "swing.bvh").write_text(text(*swing(121, "Left")))
+    with pytest.raises(ValueError, match="publish is set"):
+        benchmark.main(clips=tmp_path, publish=True)
+    Path("RESULTS.md").write_text("# Results\n")
     benchmark.main(clips=tmp_path)
+    assert Path("RESULTS.md").read_text() == "# Results\n"
+    benchmark.main(clips=tmp_path, publish=True)
     found = json.loads(Path("runs/benchmarks/reference.json").read_text())
     assert [(row["name"], row["kind"]) for row in found["rows"]] == [("embedded", "kick"), ("swing", "walk")]
     assert found["rows"][1]["knee_strike_deg"] == pytest.approx(20.0)

@@ -20,6 +20,7 @@ from tasks.presets import PRESETS, Preset, preset_of
 PROTOCOL = {
     "target",
     "truth_error_m",
+    "limit_error_m",
     "model_error_m",
     "reference_deviation_m",
     "ball_speed_m_s",
@@ -82,12 +83,24 @@ def test_tasks_are_drawn_within_the_protocols_bounds() -> None:
 
 
 def test_with_the_truth_as_model_what_is_predicted_happens(task: kick.Kick, small: None) -> None:
-    planners = kick.planners_of(task, preset_of("fast"), kick.models_of(task.scene, "mujoco", stored.SHIPPED))
+    models = kick.models_of(task.scene, "mujoco", stored.SHIPPED, substeps=task.substeps)
+    planners = kick.planners_of(task, preset_of("fast"), models)
     target = np.array([3.0, 0.2, 0.4])
     execution = task.run(planners._replace(every=100), target, seed=0)
     report = task.report(execution, target)
     assert report["touched"]
     assert report["truth_error_m"] == pytest.approx(report["model_error_m"], abs=0.01)
+
+
+def test_the_limit_is_the_miss_of_the_same_controls_at_the_finer_step(small: None) -> None:
+    coarse = kick.prepare(substeps=4)
+    models = kick.models_of(coarse.scene, "mujoco", stored.SHIPPED, substeps=4)
+    target = np.array([3.0, 0.2, 0.4])
+    execution = coarse.run(kick.planners_of(coarse, preset_of("fast"), models), target, seed=0, steps=120)
+    report = coarse.report(execution, target)
+    assert coarse.replayed(execution, target, substeps=4) == pytest.approx(report["truth_error_m"], abs=1e-6)
+    assert report["limit_error_m"] == coarse.replayed(execution, target)
+    assert abs(report["limit_error_m"] - report["truth_error_m"]) > 0.01
 
 
 def test_a_kick_end_to_end_leaves_all_its_files_and_they_agree(tmp_path: Path, small: None) -> None:
@@ -108,6 +121,12 @@ def test_a_target_out_of_reach_is_marked_and_still_gets_a_plan(task: kick.Kick, 
     report = task.report(task.run(planners, target, seed=0), target)
     assert not report["reachable"]
     assert np.isfinite(report["truth_error_m"])
+
+
+def test_an_output_folder_that_cannot_be_written_is_refused_before_anything_else(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match="out needs the folder"):
+        kick.main(out=tmp_path / "file" / "kick", weights=Path("nowhere.json"))
 
 
 @pytest.mark.parametrize(

@@ -114,6 +114,7 @@ def main(
     seed: int = 0,
     json: Path = Path("runs/benchmarks/gap.json"),
     weights: Path = stored.SHIPPED / f"{WEIGHTS}.json",
+    publish: bool = False,
 ) -> None:
     """Compare model and truth on the planner's own candidates.
 
@@ -123,10 +124,12 @@ def main(
         seed: of targets, ball spots and planner.
         json: where the figures go; the picture goes beside them.
         weights: manifest of the weights of the learned model.
+        publish: put the table into RESULTS.md.
     """
     for name, value in (("targets", targets), ("candidates", candidates)):
         if value < 1:
             raise ValueError(f"{name} is {value}, but must be at least 1")
+    report.ready(json, publish)
     remember_compilations()
     kick = prepare()
     models, truth = models_of(kick.scene, "larp", weights), models_of(kick.scene, "mujoco", weights)
@@ -150,7 +153,8 @@ def main(
             values = ", ".join(f"{q} {scale * found[measure][q]:.1f}{unit}" for q in ("median", "p75", "p90"))
             table.add_row(f"launch from {before} steps before contact, {measure}, {found['count']} balls", values)
     report.show(table)
-    report.publish("gap", f"Gap on the planner's own candidates, {targets} kicks", command, table)
+    if publish:
+        report.publish("gap", f"Gap on the planner's own candidates, {targets} kicks", command, table)
 
 
 if __name__ == "__main__":

@@ -43,6 +43,7 @@ def main(
     json: Path | None = None,
     weights: Path = stored.SHIPPED / f"{WEIGHTS}.json",
     states: Path | None = None,
+    publish: bool = False,
 ) -> None:
     """Compare rollouts of the learned simulator with truth episodes from unseen initial states.
 
@@ -53,12 +54,14 @@ def main(
         json: where the figures go; the picture goes beside them.
         weights: manifest of the weights.
         states: truth episodes (.npz) to evaluate on instead.
+        publish: put the table into RESULTS.md.
     """
     if scene not in SCENES:
         raise ValueError(f"scene is {scene!r}, but must be one of {', '.join(SCENES)}")
     if sequences < 1:
         raise ValueError(f"sequences is {sequences}, but must be at least 1")
     json = json or Path(f"runs/benchmarks/model_{scene}.json")
+    report.ready(json, publish)
     remember_compilations()
     kick = prepare()
     config, learned, _ = stored.load(weights, kick.scene)
@@ -86,7 +89,8 @@ def main(
             cells = (f"{name} {value:.3g}{unit}" for name, value in launch[measure].items())
             table.add_row(f"launch from {before} steps before contact, {measure}, {launch['count']} balls", *cells)
     report.show(table)
-    report.publish(f"model_{scene}", f"Model: {scene}", command, table)
+    if publish:
+        report.publish(f"model_{scene}", f"Model: {scene}", command, table)
 
 
 if __name__ == "__main__":

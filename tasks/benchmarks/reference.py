@@ -145,16 +145,20 @@ def picture(kicks: list[Kick]) -> Figure:
     return figure
 
 
-def main(clips: Path | None = None, json: Path = Path("runs/benchmarks/reference.json")) -> None:
+def main(clips: Path | None = None, json: Path = Path("runs/benchmarks/reference.json"), publish: bool = False) -> None:
     """Compare the embedded kick with captured ones.
 
     Args:
         clips: folder of captured kicks (BVH).
         json: where the figures go; the picture goes beside them.
+        publish: put the table into RESULTS.md.
     """
     paths = sorted(clips.glob("*.bvh")) if clips else []
     if clips and not paths:
         raise ValueError(f"clips is {str(clips)!r}, but must be a folder that holds .bvh files")
+    if publish and not clips:
+        raise ValueError("publish is set, but there are no clips to compare with: clips must be a folder of .bvh files")
+    report.ready(json, publish)
     scene = human_and_ball()
     kicks = [performed("embedded", scene, embedded(scene)), *(recorded(path, scene) for path in paths)]
     command = "python -m tasks.benchmarks.reference" + (" --clips DIR" if clips else "")
@@ -162,9 +166,9 @@ def main(clips: Path | None = None, json: Path = Path("runs/benchmarks/reference
     report.write_json(json, {"command": command, "hardware": report.hardware(), "rows": rows})
     report.write_picture(json.with_suffix(".png"), picture(kicks))
     report.show(table(kicks))
-    if clips:
+    if publish:
         report.publish("reference", "Reference: the embedded kick and captured ones", command, table(kicks))
-    else:
+    if not clips:
         print("No clips to compare with: --clips names a folder of BVH files.")
 
 

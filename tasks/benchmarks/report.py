@@ -1,11 +1,14 @@
-"""What every benchmark does: name the hardware, write its JSON, its picture and its part of RESULTS.md."""
+"""What every benchmark does: keep finished rows, name the hardware, write its JSON, its picture and its results."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import platform
 import re
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +18,79 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-from larp_model.files import write_whole, written_whole
+from larp_model.files import require_writable, write_whole, written_whole
 
 RESULTS = Path("RESULTS.md")
+# Pictures that the README shows.
+PICTURES = Path("docs")
+PROJECT = Path(__file__).parents[2]
+
+Row = dict[str, Any]
+
+
+def ready(path: Path, publish: bool) -> None:
+    """Refuses, before anything is computed, a JSON that could not be written or results that have no place."""
+    require_writable(path.parent, "json")
+    if publish and not RESULTS.is_file():
+        raise ValueError(f"publish is set, but {RESULTS} is not in this folder: run it where the project lies")
+
+
+def collect(path: Path, command: str, jobs: Mapping[str, Callable[[], Row]]) -> list[Row]:
+    """The row of every job, by name; each is kept beside the JSON `path` as soon as it is done.
+
+    A run that was cut off goes on where it was, if command, hardware, code and weights are the same. Says how long it
+    has still to go.
+    """
+    made_by = {"command": command, "hardware": hardware(), "version": version()}
+    kept = _partial(path)
+    done = _rows_of(kept, made_by)
+    console = Console(stderr=True)
+    if done:
+        console.print(f"{len(done)} of {len(jobs)} rows are kept in {kept}")
+    begin, fresh = time.monotonic(), 0
+    for name, job in jobs.items():
+        if name in done:
+            continue
+        done[name] = job()
+        write_whole(kept, (json.dumps({"made_by": made_by, "rows": done}) + "\n").encode())
+        fresh += 1
+        left = (time.monotonic() - begin) / fresh * (len(jobs) - len(done))
+        console.print(f"{len(done)} of {len(jobs)}: {name}; {_duration(left)} left", markup=False, highlight=False)
+    return [done[name] for name in jobs]
+
+
+def _partial(path: Path) -> Path:
+    return path.with_suffix(".partial.json")
+
+
+def _rows_of(kept: Path, made_by: Mapping[str, str]) -> dict[str, Row]:
+    """Rows that a run of the same kind left behind; none where there was no such run."""
+    try:
+        found = json.loads(kept.read_text())
+        return dict(found["rows"]) if found["made_by"] == made_by else {}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"about {minutes} min" if minutes else f"about {rest} s"
+
+
+def version() -> str:
+    """A digest of what a figure depends on: the code and the weights, other benchmarks included."""
+    digest = hashlib.sha256()
+    for package in ("larp_model", "mpc", "tasks"):
+        for file in sorted((PROJECT / package).rglob("*")):
+            if file.suffix in (".py", ".json", ".safetensors"):
+                digest.update(file.relative_to(PROJECT).as_posix().encode())
+                digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def cores() -> int:
+    """How many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def hardware() -> str:
@@ -29,12 +102,13 @@ def hardware() -> str:
         model = found.group(1) if found else model
     accelerators = [device.device_kind for device in jax.devices() if device.platform != "cpu"]
     extra = f", {accelerators[0]}" if accelerators else ""
-    return f"{model}, {os.cpu_count()} cores{extra}, jax {jax.__version__}"
+    return f"{model}, {cores()} cores{extra}, jax {jax.__version__}"
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write a benchmark's JSON, whole or not at all."""
+    """Write a benchmark's JSON, whole or not at all; the rows kept on the way are no longer needed."""
     write_whole(path, (json.dumps(content, indent=2) + "\n").encode())
+    _partial(path).unlink(missing_ok=True)
 
 
 def write_picture(path: Path, figure: Figure) -> None:
@@ -48,7 +122,7 @@ def publish(name: str, title: str, command: str, table: Table) -> None:
     """Put a benchmark's table into RESULTS.md, in place of its last one, with the command above it."""
     begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
     part = f"{begin}\n## {title}\n\n`{command}`\n\n{markdown(table)}\n\nMeasured on {hardware()}.\n{end}"
-    text = RESULTS.read_text() if RESULTS.exists() else "# Results\n\nWritten by the benchmarks, never by hand.\n"
+    text = RESULTS.read_text()
     if begin in text:
         before, after = text.split(begin)[0], text.split(end)[1]
         text = before + part + after

@@ -1,0 +1,96 @@
+"""What all benchmarks promise: nothing is lost when they are cut off, and nothing tracked changes unasked."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from pathlib import Path
+
+import pytest
+from rich.table import Table
+
+from mpc import CEM
+from tasks.benchmarks import kick, report
+from tasks.presets import PRESETS, Preset
+
+
+class CutOff(Exception):
+    """What ends a run before its time."""
+
+
+def jobs(done: list[int], until: int = 5) -> dict[str, partial[report.Row]]:
+    """Five rows, each of which notes that it was computed; the run is cut off at `until`."""
+
+    def one(number: int) -> report.Row:
+        if number == until:
+            raise CutOff
+        done.append(number)
+        return {"number": number}
+
+    return {f"row {number}": partial(one, number) for number in range(5)}
+
+
+def test_a_run_that_was_cut_off_goes_on_where_it_was(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "some.json"
+    done: list[int] = []
+    with pytest.raises(CutOff):
+        report.collect(path, "python -m some", jobs(done, until=3))
+    assert done == [0, 1, 2] and not path.exists()
+    rows = report.collect(path, "python -m some", jobs(done))
+    assert done == [0, 1, 2, 3, 4]
+    assert [row["number"] for row in rows] == [0, 1, 2, 3, 4]
+    assert "left" in capsys.readouterr().err
+    report.write_json(path, {"rows": rows})
+    assert [file.name for file in tmp_path.iterdir()] == ["some.json"]
+
+
+@pytest.mark.parametrize("change", ["command", "version", "damage"])
+def test_rows_of_another_kind_are_not_taken_over(change: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "some.json"
+    done: list[int] = []
+    report.collect(path, "python -m some", jobs(done))
+    if change == "version":
+        monkeypatch.setattr(report, "version", lambda: "another")
+    if change == "damage":
+        (tmp_path / "some.partial.json").write_text("{")
+    report.collect(path, f"python -m {'other' if change == 'command' else 'some'}", jobs(done))
+    assert done == 2 * [0, 1, 2, 3, 4]
+
+
+def test_a_json_that_could_not_be_written_is_refused_before_anything_else(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match="json needs the folder"):
+        kick.main(json=tmp_path / "file" / "kick.json", weights=Path("nowhere.json"))
+
+
+def test_results_are_published_only_where_the_project_lies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match="publish"):
+        kick.main(publish=True, weights=Path("nowhere.json"))
+
+
+def test_publishing_replaces_a_part_and_leaves_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    report.RESULTS.write_text("# Results\n")
+    table = Table("measure", "value")
+    table.add_row("speed", "1")
+    for name in ("one", "two", "one"):
+        report.publish(name, name.title(), f"python -m {name}", table)
+    text = report.RESULTS.read_text()
+    assert text.count("## One") == text.count("## Two") == 1
+    assert text.index("## One") < text.index("## Two")
+    assert "| speed | 1 |" in text
+
+
+def test_the_kick_benchmark_keeps_its_rows_and_touches_no_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    report.RESULTS.write_text("# Results\n")
+    search = (CEM(samples=16, rounds=1, elites=4),)
+    monkeypatch.setitem(PRESETS, "fast", Preset(search, search, every=40))
+    kick.main(targets=1, preset="fast")
+    found = json.loads(Path("runs/benchmarks/kick_fast_larp.json").read_text())
+    (row,) = found["rows"]
+    assert row["limit_error_m"] == found["mean_limit_error_m"] == row["truth_error_m"]
+    assert report.RESULTS.read_text() == "# Results\n"
