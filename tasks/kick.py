@@ -200,8 +200,12 @@ class Kick:
         steps: int | None = None,
         observe: Callable[[Execution], None] = lambda execution: None,
         sense: Callable[[np.ndarray], np.ndarray] = lambda state: state,
+        stands: bool = True,
     ) -> Execution:
-        """Plan and execute one kick in the truth from a state of `start`, for `steps` or until 2 s after contact."""
+        """Plan and execute one kick in the truth from a state of `start`, for `steps` or until 2 s after contact.
+
+        stands: whether plans go on after the kick, to keep the human up.
+        """
         state = self.start() if state is None else state
         steps = self.reference.strike + 20 + AFTER_CONTACT if steps is None else steps
         free = self.untouched(state, steps)
@@ -211,13 +215,14 @@ class Kick:
             return bool(np.linalg.norm(apart[packed.VELOCITY]) >= 0.5 or abs(apart[packed.POSITION]).max() >= 0.03)
 
         first, again, every, stand = planners
+        phases = [Phase(first, again, every, self.window(target), touched, LINGER)]
+        if stands:
+            standing = Standing(self.scene, self.reference)
+            phases.append(Phase(stand, stand, STAND_EVERY, standing.window, links=self.human))
         return execute(
             Truth(self.scene, 1, self.substeps, threads=1),
             state,
-            (
-                Phase(first, again, every, self.window(target), touched, LINGER),
-                Phase(stand, stand, STAND_EVERY, Standing(self.scene, self.reference).window, links=self.human),
-            ),
+            phases,
             steps,
             key=jax.random.key(seed),
             dt=self.scene.dt,
@@ -267,7 +272,6 @@ class Kick:
             "truth_rollouts": sum(replan.info.verified for replan in plans),
             "gap": gap(self.scene, states, self.predicted(execution), last.step, free),
         }
-
 
     def replayed(self, execution: Execution, target: np.ndarray, substeps: int = FINE_SUBSTEPS) -> float:
         """The miss [m] of the executed controls, replayed from the start in the truth at another step."""

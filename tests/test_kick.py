@@ -86,7 +86,7 @@ def test_with_the_truth_as_model_what_is_predicted_happens(task: kick.Kick, smal
     models = kick.models_of(task.scene, "mujoco", stored.SHIPPED, substeps=task.substeps)
     planners = kick.planners_of(task, preset_of("fast"), models)
     target = np.array([3.0, 0.2, 0.4])
-    execution = task.run(planners._replace(every=100), target, seed=0)
+    execution = task.run(planners._replace(every=100), target, seed=0, stands=False)
     report = task.report(execution, target)
     assert report["touched"]
     assert report["truth_error_m"] == pytest.approx(report["model_error_m"], abs=0.01)
@@ -96,7 +96,8 @@ def test_the_limit_is_the_miss_of_the_same_controls_at_the_finer_step(small: Non
     coarse = kick.prepare(substeps=4)
     models = kick.models_of(coarse.scene, "mujoco", stored.SHIPPED, substeps=4)
     target = np.array([3.0, 0.2, 0.4])
-    execution = coarse.run(kick.planners_of(coarse, preset_of("fast"), models), target, seed=0, steps=120)
+    planners = kick.planners_of(coarse, preset_of("fast"), models)
+    execution = coarse.run(planners, target, seed=0, stands=False)
     report = coarse.report(execution, target)
     assert coarse.replayed(execution, target, substeps=4) == pytest.approx(report["truth_error_m"], abs=1e-6)
     assert report["limit_error_m"] == coarse.replayed(execution, target)
