@@ -39,12 +39,16 @@ view: $(READY)
 train: $(READY)
 	@$(RUN) tasks.train
 
-KICK := $(RUN) tasks.benchmarks.kick --seed 7
+KICK := $(RUN) tasks.benchmarks.kick --seed 7 --publish
 
 bench: $(READY)
-	$(RUN) tasks.benchmarks.model --scene human_ball --sequences 256 --seed 1
-	$(RUN) tasks.benchmarks.gap --targets 8 --seed 7
-	for preset in fast balanced accurate; do $(KICK) --targets 64 --preset $$preset || exit; done
+	$(RUN) tasks.benchmarks.speed --publish
+	$(RUN) tasks.benchmarks.tradeoff --publish
+	$(RUN) tasks.benchmarks.stability --publish
+	$(RUN) tasks.benchmarks.model --scene human_ball --sequences 256 --seed 1 --publish
+	$(RUN) tasks.benchmarks.gap --targets 8 --seed 7 --publish
+	for preset in fast balanced accurate; do $(KICK) --targets 32 --preset $$preset || exit; done
+	for preset in fast balanced accurate; do $(KICK) --targets 32 --preset $$preset --substeps 20 || exit; done
 	for seconds in 1 5; do $(KICK) --preset balanced --dynamics mujoco --budget $$seconds || exit; done
 	$(KICK) --preset balanced --budget 1
 	$(KICK) --preset accurate --budget 5

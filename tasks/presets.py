@@ -77,8 +77,11 @@ def within(preset: Preset, seconds: float, measure: Callable[[Preset], Seconds])
     if not (math.isfinite(seconds) and seconds > 0.0):
         raise ValueError(f"budget is {seconds}, but must be a finite number of seconds > 0")
     fitting, factors = preset, Seconds(1.0, 1.0, 1.0)
+    least = scaled(preset, Seconds(0.0, 0.0, 0.0))
     for _ in range(3):
         took = measure(fitting)
+        if fitting == least and took.first > seconds:
+            raise ValueError(f"budget is {seconds:g} s, but the least that this preset needs is {took.first:.2g} s")
         again = AGAIN * seconds
         factors = Seconds(
             factors.first * seconds / took.first,

@@ -41,6 +41,14 @@ def test_a_budget_that_is_no_time_is_refused(seconds: float) -> None:
         within(PRESETS["fast"], seconds, lambda preset: Seconds(1.0, 1.0, 1.0))
 
 
+def test_a_budget_below_what_the_preset_can_do_says_what_the_least_is() -> None:
+    def measure(preset: Preset) -> Seconds:
+        return Seconds(*(0.01 + 2e-3 * candidates(each) for each in (preset.first, preset.again, preset.stand)))
+
+    with pytest.raises(ValueError, match=r"budget is 0\.02 s, but the least .* 0\.026 s"):
+        within(PRESETS["balanced"], 0.02, measure)
+
+
 def test_an_unknown_preset_lists_the_known_ones() -> None:
     with pytest.raises(ValueError, match="fast, balanced, accurate"):
         preset_of("quick")
