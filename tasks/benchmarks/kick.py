@@ -28,6 +28,7 @@ def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """The figures of a set of kicks."""
     truth = np.array([row["truth_error_m"] for row in rows])
     limit = np.array([row["limit_error_m"] for row in rows])
+    halved = np.array([row["halved_error_m"] for row in rows])
     again = np.array([row["replan_ms"]["p50"] for row in rows])
     worst = np.array([row["replan_ms"]["p99"] for row in rows])
     return {
@@ -37,6 +38,9 @@ def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "mean_limit_error_m": float(limit.mean()),
         "median_limit_error_m": float(np.median(limit)),
         "p95_limit_error_m": float(np.quantile(limit, 0.95)),
+        "mean_halved_error_m": float(halved.mean()),
+        "median_halved_error_m": float(np.median(halved)),
+        "p95_halved_error_m": float(np.quantile(halved, 0.95)),
         "success": {str(reach): float((truth <= reach).mean()) for reach in WITHIN},
         "mean_model_error_m": float(np.mean([row["model_error_m"] for row in rows])),
         "mean_gap_m": float(np.mean([abs(row["truth_error_m"] - row["model_error_m"]) for row in rows])),
@@ -151,6 +155,7 @@ def main(
         sense = noisy(kick.scene, np.random.default_rng((seed, index))) if noise else lambda state: state
         execution = kick.run(planners, target, seed + index, kick.start(shift, roll), sense=sense)
         return kick.report(execution, target) | {
+            "halved_error_m": kick.replayed(execution, target, 2 * substeps),
             "preset": preset,
             "dynamics": dynamics,
             "weights": models.weights,
@@ -174,13 +179,17 @@ def main(
     title = ", ".join([f"Kick: {preset}", dynamics, *(f"{option} {value}" for option, value in said.items())])
     report.write_json(json, {"command": command, "hardware": report.hardware(), **figures, "rows": rows})
     report.write_picture(json.with_suffix(".png"), picture(rows, title))
+
+    def three(figure: str) -> str:
+        return ", ".join(f"{figures[f'{which}_{figure}']:.3f} m" for which in ("mean", "median", "p95"))
+
     table = Table("measure", "value", title=title)
     for measure, value in (
         ("mean truth error", f"{figures['mean_truth_error_m']:.3f} m"),
         ("median, 90th percentile", f"{figures['median_truth_error_m']:.3f} m, {figures['p90_truth_error_m']:.3f} m"),
-        (
-            "replayed at 80 engine steps: mean, median, 95th percentile",
-            ", ".join(f"{figures[f'{which}_limit_error_m']:.3f} m" for which in ("mean", "median", "p95")),
+        *(
+            (f"replayed at {steps} engine steps: mean, median, 95th percentile", three(f"{which}_error_m"))
+            for steps, which in ((FINE_SUBSTEPS, "limit"), (2 * substeps, "halved"))
         ),
         *((f"within {reach} m", f"{100 * figures['success'][str(reach)]:.0f} %") for reach in WITHIN),
         ("mean model error", f"{figures['mean_model_error_m']:.3f} m"),

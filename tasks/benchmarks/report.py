@@ -55,7 +55,7 @@ def collect(path: Path, command: str, jobs: Mapping[str, Callable[[], Row]]) -> 
         write_whole(kept, (json.dumps({"made_by": made_by, "rows": done}) + "\n").encode())
         fresh += 1
         left = (time.monotonic() - begin) / fresh * (len(jobs) - len(done))
-        console.print(f"{len(done)} of {len(jobs)}: {name}; {_duration(left)} left", markup=False, highlight=False)
+        console.print(f"{len(done)} of {len(jobs)}: {name}; {_duration(left)} left", highlight=False, soft_wrap=True)
     return [done[name] for name in jobs]
 
 
