@@ -75,31 +75,34 @@ def points() -> Iterator[Point]:
     """What is measured: the presets, and what lies around them."""
     yield from map(Point, PRESETS.values())
     for samples, rounds, elites in (
-        (64, 2, 12), (64, 4, 12), (64, 8, 12), (128, 2, 16), (128, 8, 16), (256, 4, 24), (512, 4, 32), (512, 12, 32),
+        (32, 4, 8), (32, 16, 8), (64, 2, 12), (64, 4, 12), (64, 8, 12), (64, 16, 12), (128, 2, 16), (128, 8, 16),
+        (256, 4, 24), (512, 4, 32),
     ):  # fmt: skip
-        again = cem(samples // 2, max(1, rounds // 3), elites)
+        again = cem(max(2 * elites, samples // 2), max(1, rounds // 3), elites)
         yield Point(Preset((cem(samples, rounds, elites),), (again,), every=5))
-    quick, wide = cem(128, 4, 16), cem(256, 10, 24)
+    quick, few = cem(128, 4, 16), cem(64, 1, 16)
+    wide, some = cem(256, 10, 24), cem(128, 3, 24)
+    deep, deeper = cem(64, 8, 12), cem(64, 16, 12)
     for every in (1, 2, 3, 8, 12):
-        yield Point(Preset((quick,), (cem(64, 1, 16),), every))
-    for every, again in ((2, cem(128, 3, 24)), (8, cem(128, 3, 24)), (4, cem(128, 1, 24)), (4, cem(256, 6, 24))):
-        yield Point(Preset((wide,), (again,), every))
+        yield Point(Preset((quick,), (few,), every))
+    yield Point(Preset((quick,), (cem(128, 2, 16),), every=5))
+    yield Point(Preset((wide,), (some,), every=8))
+    yield Point(Preset((wide,), (cem(128, 1, 24),), every=4))
     for elites, steps in ((8, 4), (8, 8), (16, 8)):
-        yield Point(Preset((quick, Gradient(steps=steps, elites=elites)), (cem(64, 1, 16),), every=5))
-    yield Point(Preset((quick,), (cem(64, 1, 16), Gradient(steps=2, elites=8)), every=5))
-    yield Point(Preset((wide, Gradient(steps=8, elites=16)), (cem(128, 3, 24),), every=4))
-    yield Point(Preset((wide, Gradient(steps=8, elites=16)), (cem(128, 3, 24), Gradient(steps=4, elites=8)), every=4))
+        yield Point(Preset((quick, Gradient(steps=steps, elites=elites)), (few,), every=5))
+    yield Point(Preset((quick,), (few, Gradient(steps=2, elites=8)), every=5))
     yield Point(Preset((Gradient(steps=16, elites=32),), (Gradient(steps=4, elites=32),), every=5))
+    yield Point(Preset((wide, Gradient(steps=8, elites=16)), (some,), every=4))
     for verify in ((1, 1), (2, 1), (4, 2)):
-        yield Point(Preset((quick,), (cem(64, 1, 16),), every=5, verify=verify))
-    for verify in ((1, 1), (2, 1), (2, 2), (4, 2)):
-        yield Point(Preset((wide,), (cem(128, 3, 24),), every=4, verify=verify))
-    yield Point(Preset((wide,), (cem(128, 3, 24),), every=2, verify=(4, 2)))
+        yield Point(Preset((quick,), (few,), every=5, verify=verify))
+    yield Point(Preset((wide,), (some,), every=4, verify=(2, 2)))
+    for first, every, verify in ((deep, 5, (2, 2)), (deep, 5, (4, 2)), (deeper, 2, (4, 2))):
+        yield Point(Preset((first,), (cem(32, 2, 12),), every, verify))
     for substeps in (5, 10, 20):
         for first, again in (
             (cem(64, 2, 12), cem(32, 1, 12)),
-            (cem(128, 2, 16), cem(64, 1, 16)),
-            (quick, cem(64, 1, 16)),
+            (cem(128, 2, 16), few),
+            (quick, few),
         ):
             yield Point(Preset((first,), (again,), every=5), "mujoco", substeps)
 
