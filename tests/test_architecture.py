@@ -69,6 +69,8 @@ ORDER = [
     "tasks.benchmarks.gap",
     "tasks.benchmarks.model",
     "tasks.benchmarks.reference",
+    "tasks.benchmarks.engines",
+    "tasks.benchmarks.replays",
     "tasks.benchmarks.speed",
     "tasks.benchmarks.tradeoff",
     "tasks.benchmarks.stability",

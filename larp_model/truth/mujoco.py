@@ -119,6 +119,10 @@ class Truth:
         """The packed states (N, L, 13)."""
         return np.array(self._sensors).reshape(self.batch, -1, packed.SIZE)
 
+    def coordinates(self) -> tuple[np.ndarray, np.ndarray]:
+        """MuJoCo's own positions (N, nq) and velocities (N, nv), for engines that read its models."""
+        return np.array(self._batch.bind("qpos")), np.array(self._batch.bind("qvel"))
+
     def reset(self, states: np.ndarray) -> None:
         """Put the simulations into the packed states (N, L, 13), or all into the one state (L, 13).
 

@@ -1,0 +1,434 @@
+"""One question about speed, answered in a process of its own: how long does an engine take for a step of a scene?
+
+    python -m tasks.benchmarks.engines '{"engine": "mujoco", "scene": "human", ...}'
+
+prints the answer as JSON in its last line. Every engine starts from the same states, recorded in MuJoCo, under the
+reference's joint targets, each row of the batch with a small offset of its own, as a planner's candidates have.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import resource
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from larp_model import state as packed
+from larp_model import weights as stored
+from larp_model.bodies import human_and_ball
+from larp_model.scene import Scene
+from larp_model.simulator import Simulator
+from larp_model.truth.mujoco import SUBSTEPS, Truth, compile_model
+from mpc.dynamics import BatchedTruth
+from tasks.benchmarks import report
+from tasks.references import embedded
+
+# A row is the median of so many runs of so many steps, or of as many as fit into these seconds.
+STEPS, RUNS, SECONDS = 100, 5, 3.0
+# Steps through which a gradient is taken.
+GRADIENT_STEPS = 60
+# The strike: it begins so many steps before the ball moves, and for so many a link is near the ball.
+BEFORE_STRIKE, STRIKE_STEPS = 1, 4
+# A ball out of reach is so far away [m].
+AWAY = 100.0
+# Spread of the offsets of joint targets [rad].
+OFFSETS = 0.02
+# A ball in flight, so many steps after the strike.
+FLYING = 8
+WEIGHTS = stored.SHIPPED / "human_ball.json"
+PIPELINES = ("generalized", "spring", "positional")
+
+NAMES = {
+    "larp": "LARP",
+    "mujoco": "MuJoCo",
+    "mjx": "MJX",
+    **{f"brax {pipeline}": f"Brax {pipeline}" for pipeline in PIPELINES},
+    "bullet": "Bullet",
+}
+
+Leaves = Any
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is asked: an engine's time for a step of `scene.dt`, or for a gradient through `GRADIENT_STEPS` of them.
+
+    scene: ball, human or human_ball. reach: of the latter, "far" or "struck", else None. substeps: engine steps in a
+    step; 1 for the learned simulator. seed: of the offsets of joint targets.
+    """
+
+    engine: str
+    scene: str
+    reach: str | None
+    substeps: int
+    batch: int
+    gradient: bool = False
+    seed: int = 0
+
+    @property
+    def coarse(self) -> bool:
+        """Whether the engine runs at a step with which a kick is not converged."""
+        return self.engine != "larp" and self.substeps < SUBSTEPS
+
+    @property
+    def name(self) -> str:
+        """The question in a few words."""
+        what = " gradient" if self.gradient else ""
+        return f"{titled(self.engine, self.substeps)}{what}, {case(self.scene, self.reach)}, batch {self.batch}"
+
+
+def titled(engine: str, substeps: int) -> str:
+    """An engine's name with its engine steps."""
+    return NAMES[engine] if engine == "larp" else f"{NAMES[engine]} {substeps}"
+
+
+def case(scene: str, reach: str | None) -> str:
+    """A scene's name with where its ball is."""
+    return " ".join(filter(None, (scene, reach)))
+
+
+class Course(NamedTuple):
+    """A scene, its states (N, L, 13) to begin with and joint targets (N, T, J, 3) [rad] for T steps.
+
+    After T steps it begins again.
+    """
+
+    scene: Scene
+    states: np.ndarray
+    controls: np.ndarray
+
+
+def course(question: Question) -> Course:
+    """What every engine simulates.
+
+    ball: in flight, after the reference's strike. human: the reference. human_ball far: the reference, with the ball
+    100 m away. human_ball struck: the four steps around the strike, in each of which a link is near the ball, over and
+    over; where a gradient is asked for, the reference from its start, with the strike in it.
+    """
+    whole = human_and_ball()
+    reference = embedded(whole)
+    begin, steps = 0, GRADIENT_STEPS if question.gradient else STEPS
+    if question.reach == "struck" and not question.gradient:
+        begin, steps = reference.strike - BEFORE_STRIKE, STRIKE_STEPS
+    if question.scene == "ball":
+        begin = reference.strike + FLYING
+    bodies = question.scene.split("_")
+    links = np.concatenate([np.arange(len(whole.links))[whole.rows(body)] for body in bodies])
+    motors = np.concatenate([np.arange(len(whole.motors))[whole.motor_rows(body)] for body in bodies])
+    state = reference.states[begin, links]
+    if question.reach == "far":
+        state[-1, 0] += AWAY
+    targets = reference.controls[begin : begin + steps, motors.astype(int)]
+    random = np.random.default_rng(question.seed)
+    offsets = OFFSETS * random.standard_normal((question.batch, 1, len(motors), 3))
+    states = np.broadcast_to(state, (question.batch, *state.shape))
+    return Course(whole.only(*bodies), states, (targets + offsets).astype(np.float32))
+
+
+class Traced(NamedTuple):
+    """An engine that JAX compiles: where a batch begins, and the step of what it carries on.
+
+    start: states (N, L, 13) -> what it begins with. enter: that -> carried. step: carried, joint targets (N, J, 3) ->
+    carried. ball: carried -> position and velocity (N, 6) [m, m/s] of the scene's last body, a ball.
+    """
+
+    start: Callable[[np.ndarray], Leaves]
+    enter: Callable[[Leaves], Leaves]
+    step: Callable[[Leaves, Array], Leaves]
+    ball: Callable[[Leaves], Array]
+
+
+def larp(scene: Scene, substeps: int) -> Traced:
+    """The learned simulator with the shipped weights."""
+    config, weights, _ = stored.load(WEIGHTS, human_and_ball())
+    simulator = Simulator(scene, config, weights)
+
+    def ball(state: Array) -> Array:
+        return jnp.concatenate([state[:, -1, packed.POSITION], state[:, -1, packed.VELOCITY]], axis=-1)
+
+    return Traced(partial(jnp.asarray, dtype=jnp.float32), lambda start: start, simulator.step, ball)
+
+
+def mjx(scene: Scene, substeps: int) -> Traced:
+    """MuJoCo in JAX, with the model that MuJoCo has."""
+    from mujoco import mjx
+
+    compiled = compile_model(scene, substeps)
+    model, blank = mjx.put_model(compiled), mjx.make_data(compiled)
+
+    def enter(start: Leaves) -> Leaves:
+        position, velocity = start
+        return position, velocity, jnp.zeros_like(velocity)
+
+    def engine_step(_: Any, carried: Leaves, control: Array) -> Leaves:
+        position, velocity, acceleration = carried
+        data = blank.replace(qpos=position, qvel=velocity, qacc_warmstart=acceleration, ctrl=control)
+        after = mjx.step(model, data)
+        return after.qpos, after.qvel, after.qacc_warmstart
+
+    @jax.vmap
+    def step(carried: Leaves, control: Array) -> Leaves:
+        return jax.lax.fori_loop(0, substeps, partial(engine_step, control=control.reshape(-1)), carried)
+
+    return Traced(partial(_coordinates, scene), enter, step, lambda carried: _last(*carried[:2]))
+
+
+def brax(pipeline: str, scene: Scene, substeps: int) -> Traced:
+    """One of Brax's pipelines, with MuJoCo's model: its pyramids for friction cones and its Euler steps are allowed."""
+    import importlib
+
+    import mujoco
+    from brax.io import mjcf
+
+    compiled = compile_model(scene, substeps)
+    compiled.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    compiled.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    system = mjcf.load_model(compiled)
+    chosen = importlib.import_module(f"brax.{pipeline}.pipeline")
+
+    def engine_step(_: Any, carried: Leaves, control: Array) -> Leaves:
+        return chosen.step(system, carried, control)
+
+    @jax.vmap
+    def step(carried: Leaves, control: Array) -> Leaves:
+        return jax.lax.fori_loop(0, substeps, partial(engine_step, control=control.reshape(-1)), carried)
+
+    enter = jax.vmap(lambda start: chosen.init(system, *start))
+    return Traced(partial(_coordinates, scene), enter, step, lambda carried: _last(carried.q, carried.qd))
+
+
+def _coordinates(scene: Scene, states: np.ndarray) -> tuple[Array, Array]:
+    truth = Truth(scene, len(states), threads=1)
+    truth.reset(states)
+    position, velocity = truth.coordinates()
+    return jnp.asarray(position, jnp.float32), jnp.asarray(velocity, jnp.float32)
+
+
+def _last(position: Array, velocity: Array) -> Array:
+    """Position and velocity (N, 6) of the last body, a free one, from MuJoCo's coordinates."""
+    return jnp.concatenate([position[:, -7:-4], velocity[:, -6:-3]], axis=-1)
+
+
+def bullet(scene: Scene, substeps: int, batch: int) -> BatchedTruth:
+    """Bullet, behind the same door as the truth."""
+    from larp_model.truth.bullet import BulletTruth
+
+    return BulletTruth(scene, batch, substeps)
+
+
+def mujoco(scene: Scene, substeps: int, batch: int) -> BatchedTruth:
+    """The truth, on as many threads as this process has cores."""
+    return Truth(scene, batch, substeps, threads=report.cores())
+
+
+TRACED: dict[str, Callable[[Scene, int], Traced]] = {
+    "larp": larp,
+    "mjx": mjx,
+    **{f"brax {pipeline}": partial(brax, pipeline) for pipeline in PIPELINES},
+}
+STEPPED: dict[str, Callable[[Scene, int, int], BatchedTruth]] = {"mujoco": mujoco, "bullet": bullet}
+
+
+class Refused(Exception):
+    """Why there is no figure."""
+
+
+class Compiled(NamedTuple):
+    """A compiled program and the seconds that took."""
+
+    run: Callable[..., Any]
+    seconds: float
+
+
+def compiled(program: Callable[..., Any], *arguments: Any) -> Compiled:
+    """The program compiled for these arguments; refuses one that this machine's memory cannot hold."""
+    begin = time.perf_counter()
+    ready = jax.jit(program).lower(*arguments).compile()
+    seconds = time.perf_counter() - begin
+    found, free = ready.memory_analysis(), available_memory()
+    if found is not None and free is not None:
+        needed = found.argument_size_in_bytes + found.output_size_in_bytes + found.temp_size_in_bytes
+        if needed > free:
+            raise Refused(f"needs {needed / 2**30:.1f} GiB of memory, of {free / 2**30:.1f}")
+    return Compiled(ready, seconds)
+
+
+def available_memory() -> int | None:
+    """Bytes that a program may still take on JAX's first device; None where nobody says so."""
+    device = jax.devices()[0]
+    if device.platform != "cpu":
+        found = device.memory_stats() or {}
+        return found["bytes_limit"] - found["bytes_in_use"] if "bytes_limit" in found else None
+    stated = _stated(Path("/proc/meminfo"), "MemAvailable")
+    return None if stated is None else 1024 * stated
+
+
+def peak_memory() -> float:
+    """The most memory that this process has ever held [MiB].
+
+    Linux hands `ru_maxrss` on to the programs that a process starts, so that a small child would show its parent's.
+    """
+    stated = _stated(Path("/proc/self/status"), "VmHWM")
+    if stated is not None:
+        return stated / 1024
+    unit = 2**20 if sys.platform == "darwin" else 2**10
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+
+
+def _stated(path: Path, field: str) -> int | None:
+    """A field [KiB] of one of Linux's tables."""
+    found = re.search(rf"^{field}:\s+(\d+)", path.read_text(), re.MULTILINE) if path.exists() else None
+    return int(found.group(1)) if found else None
+
+
+def timed(run: Callable[[int], float], unit: int, most: int) -> report.Row:
+    """Milliseconds a step: the median of `RUNS` runs of `most` steps, or of what fits into `SECONDS`.
+
+    run: seconds that so many steps take, a multiple of `unit`. Its first call is not counted, unless it alone takes
+    all the time.
+    """
+    first = run(unit)
+    if first > SECONDS:
+        took, steps = [first], unit
+    else:
+        once = max(run(unit), 1e-9)
+        steps = unit * int(np.clip(SECONDS / RUNS / once, 1, most // unit))
+        took = [run(steps) for _ in range(int(np.clip(SECONDS / (once * steps / unit), 1, RUNS)))]
+    each = 1e3 * np.array(took) / steps
+    return {
+        "ms_per_step": float(np.median(each)),
+        "ms_per_step_range": [float(each.min()), float(each.max())],
+        "steps": steps,
+        "runs": len(took),
+    }
+
+
+def time_traced(question: Question, what: Course) -> report.Row:
+    """Time of an engine that JAX compiles; see `timed`."""
+    traced = TRACED[question.engine](what.scene, question.substeps)
+    start, controls = traced.start(what.states), jnp.moveaxis(jnp.asarray(what.controls), 1, 0)
+    again = len(controls)
+
+    def program(start: Leaves, controls: Array, steps: Array) -> Leaves:
+        begun = traced.enter(start)
+
+        def body(step: Array, carried: Leaves) -> Leaves:
+            if again < STEPS:
+                carried = jax.tree.map(lambda new, old: jnp.where(step % again == 0, new, old), begun, carried)
+            return traced.step(carried, controls[step % again])
+
+        return jax.lax.fori_loop(0, steps, body, begun)
+
+    ready = compiled(program, start, controls, jnp.int32(1))
+
+    last: Leaves = None
+
+    def run(steps: int) -> float:
+        nonlocal last
+        begin = time.perf_counter()
+        last = jax.block_until_ready(ready.run(start, controls, jnp.int32(steps)))
+        return time.perf_counter() - begin
+
+    found = timed(run, again if again < STEPS else 1, STEPS)
+    return found | {"compile_seconds": ready.seconds, "finite": finite(last)}
+
+
+def time_gradient(question: Question, what: Course) -> report.Row:
+    """Time of `GRADIENT_STEPS` steps forward, and of these with the gradient by start and joint targets.
+
+    What is differentiated is the sum of squares of all that the engine carries at the end.
+    """
+    traced = TRACED[question.engine](what.scene, question.substeps)
+    start, controls = traced.start(what.states), jnp.moveaxis(jnp.asarray(what.controls), 1, 0)
+
+    def cost(start: Leaves, controls: Array) -> Array:
+        last, _ = jax.lax.scan(lambda each, control: (traced.step(each, control), None), traced.enter(start), controls)
+        return sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(last) if _differentiable(leaf)), jnp.float32(0.0))
+
+    last: Leaves = None
+
+    def run(steps: int) -> float:
+        nonlocal last
+        begin = time.perf_counter()
+        last = jax.block_until_ready(ready.run(start, controls))
+        return time.perf_counter() - begin
+
+    ready = compiled(cost, start, controls)
+    forward = timed(run, GRADIENT_STEPS, GRADIENT_STEPS)
+    ready = compiled(jax.grad(cost, argnums=(0, 1)), start, controls)
+    reverse = timed(run, GRADIENT_STEPS, GRADIENT_STEPS)
+    return reverse | {
+        "forward_ms": GRADIENT_STEPS * forward["ms_per_step"],
+        "reverse_ms": GRADIENT_STEPS * reverse["ms_per_step"],
+        "compile_seconds": ready.seconds,
+        "finite": finite(last),
+    }
+
+
+def _differentiable(leaf: Array) -> bool:
+    return bool(jnp.issubdtype(leaf.dtype, jnp.floating))
+
+
+def finite(leaves: Leaves) -> bool:
+    """Whether all numbers are."""
+    return all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(leaves))
+
+
+def time_stepped(question: Question, what: Course) -> report.Row:
+    """Time of an engine outside JAX; putting it into its start is not counted."""
+    engine: Any = STEPPED[question.engine](what.scene, question.substeps, question.batch)
+    again = what.controls.shape[1]
+    last = what.states
+
+    def run(steps: int) -> float:
+        nonlocal last
+        took = 0.0
+        for begin in range(0, steps, again):
+            engine.reset(what.states)
+            before = time.perf_counter()
+            for step in range(min(again, steps - begin)):
+                last = engine.step(what.controls[:, step])
+            took += time.perf_counter() - before
+        return took
+
+    found = timed(run, again if again < STEPS else 1, STEPS)
+    return found | {"compile_seconds": 0.0, "finite": bool(np.isfinite(last).all())}
+
+
+def answer(question: Question) -> report.Row:
+    """The row: time, compilation and memory, or `refused`, the reason why there is none."""
+    idle, compiles = peak_memory(), question.engine in TRACED
+    row = asdict(question) | {"device": jax.devices()[0].device_kind if compiles else "cpu", "refused": None}
+    take_time = time_gradient if question.gradient else time_traced if compiles else time_stepped
+    what = course(question)
+    try:
+        row |= take_time(question, what)
+    except ImportError as error:
+        row["refused"] = f"is not installed ({error.name or error})"
+    except Exception as error:  # an engine may refuse in any way: what it says is the answer
+        row["refused"] = words(error)
+    else:
+        row["us_per_scene_step"] = 1e3 * row["ms_per_step"] / question.batch
+        row |= {"peak_memory_mib": peak_memory(), "idle_memory_mib": idle}
+    return row
+
+
+def words(error: Exception) -> str:
+    """What an error says, in one line."""
+    said = (str(error).strip() or type(error).__name__).splitlines()[0]
+    return said if len(said) < 160 else f"{said[:157]}..."
+
+
+if __name__ == "__main__":
+    print(json.dumps(answer(Question(**json.loads(sys.argv[1])))))

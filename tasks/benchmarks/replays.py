@@ -1,0 +1,135 @@
+"""Executed kicks, replayed open loop: how far an engine goes astray from MuJoCo's own limit of small steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from itertools import chain
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from larp_model import state as packed
+from larp_model.scene import Scene
+from larp_model.truth.mujoco import Truth
+from tasks.benchmarks import report
+from tasks.benchmarks.engines import STEPPED, TRACED
+from tasks.gap import LAUNCH_STEPS, contact_step
+from tasks.kick import LINGER, Kick, Planners
+
+# MuJoCo's limit: the engine steps in a step against which all others are judged.
+LIMIT = 160
+# After the reference's strike, so many steps bring the ball past its target.
+AFTER_STRIKE = 150
+# A launch is replayed from so many steps before contact.
+BEFORE_CONTACT = 3
+
+# States (1, L, 13) and joint targets (1, H, J, 3) [rad] -> position and velocity (H, 6) [m, m/s] of the ball.
+Player = Callable[[np.ndarray, np.ndarray], np.ndarray]
+Engine = tuple[str, int]
+
+
+class Kicked(NamedTuple):
+    """An executed kick: its target (3,) [m], its start (L, 13) and the joint targets (T, J, 3) [rad] of every step."""
+
+    target: np.ndarray
+    start: np.ndarray
+    controls: np.ndarray
+
+
+def player_of(scene: Scene, engine: str, substeps: int) -> Player:
+    """An engine's replay of one kick."""
+    if engine in STEPPED:
+        truth = STEPPED[engine](scene, substeps, 1)
+
+        def stepped(states: np.ndarray, controls: np.ndarray) -> np.ndarray:
+            return ball_of(truth.rollout(states, controls)[0][0])
+
+        return stepped
+    traced = TRACED[engine](scene, substeps)
+
+    @jax.jit
+    def roll(start: Any, controls: jax.Array) -> jax.Array:
+        def step(carried: Any, control: jax.Array) -> tuple[Any, jax.Array]:
+            after = traced.step(carried, control)
+            return after, traced.ball(after)[0]
+
+        return jax.lax.scan(step, traced.enter(start), controls[0][:, None])[1]
+
+    def compiled(states: np.ndarray, controls: np.ndarray) -> np.ndarray:
+        return np.asarray(roll(traced.start(states), jnp.asarray(controls, jnp.float32)))
+
+    return compiled
+
+
+def ball_of(states: np.ndarray) -> np.ndarray:
+    """Position and velocity (H, 6) [m, m/s] of the last link in states (H, L, 13)."""
+    ball = states[:, -1]
+    return np.concatenate([ball[:, packed.POSITION], ball[:, packed.VELOCITY]], axis=-1)
+
+
+def executed(kick: Kick, planners: Planners, target: np.ndarray, seed: int, shift: np.ndarray) -> Kicked:
+    """A kick, planned and executed in the truth until the ball is away; then the reference's joint targets follow."""
+    until = kick.reference.strike + LINGER
+    execution = kick.run(planners, target, seed, kick.start(shift), steps=until)
+    _, after = kick.reference.window(until, AFTER_STRIKE - LINGER)
+    return Kicked(target, execution.states[0], np.concatenate([np.stack(execution.controls), after]))
+
+
+def astray(scene: Scene, kicked: Kicked, players: dict[Engine, Player]) -> list[report.Row]:
+    """How far each engine is from MuJoCo's limit; nothing where the limit misses the ball.
+
+    error_m: between the balls when the limit's passes nearest to the target, replayed from the kick's start.
+    launch_error: |v - v'| / |v|, `LAUNCH_STEPS` after contact, replayed from `BEFORE_CONTACT` steps before it.
+    """
+    start, controls = kicked.start[None], kicked.controls[None]
+    limit = Truth(scene, 1, LIMIT, threads=1).rollout(start, controls)[0][0]
+    states = np.concatenate([start, limit])
+    contact = contact_step(states)
+    if contact is None or contact < BEFORE_CONTACT:
+        return []
+    passing = contact + int(np.linalg.norm(states[contact:, -1, packed.POSITION] - kicked.target, axis=-1).argmin())
+    begin, launch = contact - BEFORE_CONTACT, contact + LAUNCH_STEPS
+    place, velocity = states[passing, -1, packed.POSITION], states[launch, -1, packed.VELOCITY]
+    rows = []
+    for (engine, substeps), play in players.items():
+        path = play(start, controls)
+        left = play(states[begin : begin + 1], controls[:, begin:launch])[-1, 3:]
+        rows.append(
+            {
+                "engine": engine,
+                "substeps": substeps,
+                "error_m": float(np.linalg.norm(path[passing - 1, :3] - place)),
+                "launch_error": float(np.linalg.norm(left - velocity) / np.linalg.norm(velocity)),
+            }
+        )
+    return rows
+
+
+def summarise(kicks: Iterable[list[report.Row]]) -> list[report.Row]:
+    """Each engine's errors over all kicks; None for what is not finite.
+
+    A kick in which an engine diverged is left out of its mean, and counts as infinitely far off in its medians.
+    """
+    by_engine: dict[Engine, list[report.Row]] = {}
+    for row in chain.from_iterable(kicks):
+        by_engine.setdefault((row["engine"], row["substeps"]), []).append(row)
+    found = []
+    for (engine, substeps), rows in by_engine.items():
+        errors = np.array([(row["error_m"], row["launch_error"]) for row in rows])
+        kept = np.isfinite(errors).all(axis=1)
+        errors[~kept] = np.inf
+        median, launch = np.median(errors, axis=0)
+        found.append(
+            {
+                "engine": engine,
+                "substeps": substeps,
+                "kicks": len(rows),
+                "diverged": int((~kept).sum()),
+                "mean_m": float(errors[kept, 0].mean()) if kept.any() else None,
+                "median_m": float(median) if np.isfinite(median) else None,
+                "launch_error": float(launch) if np.isfinite(launch) else None,
+            }
+        )
+    return found

@@ -1,0 +1,356 @@
+"""What a simulated step costs, engine by engine; and how exact a kick is for that price.
+
+Each row is measured in a process of its own: time, compilation and peak memory of one engine with one scene and batch.
+Each kick is planned and executed in MuJoCo once and then replayed open loop by every engine.
+"""
+
+from __future__ import annotations
+
+import json as codec
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import asdict, replace
+from functools import cache, partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from rich.table import Table
+
+from larp_model.truth.mujoco import SUBSTEPS as CONVERGED
+from tasks.benchmarks import replays, report
+from tasks.benchmarks.engines import NAMES, PIPELINES, WEIGHTS, Question, case, titled
+from tasks.data import random_task
+from tasks.kick import models_of, planners_of, prepare, remember_compilations, run
+from tasks.presets import preset_of
+
+# Engine steps in a step, by engine; all of Brax's pipelines have the same.
+SUBSTEPS = {"larp": (1,), "mujoco": (2, 4, 5, 10, 20, 40), "mjx": (20,), "brax": (20,), "bullet": (20,)}
+# Those with which kicks are replayed too, beside the above.
+MORE = {"mujoco": (80,), "mjx": (5,), "bullet": (5,)}
+CASES = {
+    "ball": (("ball", None),),
+    "human": (("human", None),),
+    "human_ball": (("human_ball", "far"), ("human_ball", "struck")),
+}
+DIFFERENTIABLE = ("larp", "mjx", "brax")
+# Gradients are asked for up to this batch, accuracy beside the time at it, and memory is shown at it.
+MIDDLE = 512
+# A row's process is ended after so many seconds.
+SECONDS = 300.0
+PRESET = "fast"
+STYLES = {"spring": "--", "positional": ":"}
+COLOURS = {"larp": "#d55e00", "mujoco": "#0072b2", "mjx": "#009e73", "brax": "#cc79a7", "bullet": "#7f7f7f"}
+
+
+def listed(name: str, text: str, known: tuple[str, ...]) -> list[str]:
+    """The words between the commas; refuses what is not known."""
+    words = [word.strip() for word in text.split(",")]
+    if odd := [word for word in words if word not in known]:
+        raise ValueError(f"{name} has {odd[0]!r}, but can have {', '.join(known)}, with commas between them")
+    return words
+
+
+def batches(text: str) -> list[int]:
+    """Batch sizes between commas, smallest first."""
+    words = text.split(",")
+    if not all(word.strip().isdecimal() and int(word) > 0 for word in words):
+        raise ValueError(f"batch is {text!r}, but must be integers of at least 1, with commas between them")
+    return sorted({int(word) for word in words})
+
+
+def variants(engine: str) -> list[str]:
+    """The engine by its pipelines, if it has any."""
+    return [f"brax {pipeline}" for pipeline in PIPELINES] if engine == "brax" else [engine]
+
+
+def questions(scenes: list[str], engines: list[str], sizes: list[int], seed: int) -> Iterator[Question]:
+    """All rows; of one engine in one case the smaller batch comes first."""
+    cases = [each for scene in scenes for each in CASES[scene]]
+    for engine in engines:
+        for name, (scene, reach), substeps in product(variants(engine), cases, SUBSTEPS[engine]):
+            for size in sizes:
+                yield Question(name, scene, reach, substeps, size, seed=seed)
+    # Gradients compile for long, and planners take those of the learned simulator in their own scene: for all else,
+    # one batch tells.
+    few = [size for size in sizes if size <= MIDDLE]
+    for engine in (engine for engine in engines if engine in DIFFERENTIABLE):
+        for name, (scene, reach) in product(variants(engine), cases):
+            for size in few if engine == "larp" and reach == "struck" else few[-1:]:
+                yield Question(name, scene, reach, SUBSTEPS[engine][-1], size, gradient=True, seed=seed)
+
+
+class Asking:
+    """Asks each question in a process of its own; what an engine refused, it is not asked again with a larger batch."""
+
+    def __init__(self) -> None:
+        self.refused: dict[Question, str] = {}
+
+    def __call__(self, question: Question) -> report.Row:
+        """The row of a question: see `engines.answer`."""
+        row, same = asdict(question) | {"coarse": question.coarse}, replace(question, batch=0)
+        row |= {"refused": self.refused[same]} if same in self.refused else self.asked(question)
+        if row["refused"] is not None:
+            self.refused[same] = row["refused"]
+        return row
+
+    def asked(self, question: Question) -> report.Row:
+        """What the process says, or what became of it."""
+        command = [sys.executable, "-m", "tasks.benchmarks.engines", codec.dumps(asdict(question))]
+        try:
+            done = subprocess.run(command, cwd=report.PROJECT, capture_output=True, text=True, timeout=SECONDS)
+        except subprocess.TimeoutExpired:
+            return {"refused": f"took longer than {SECONDS:.0f} s"}
+        if done.returncode:
+            said = (done.stderr.strip() or "nothing").splitlines()[-1]
+            return {"refused": f"its process ended with code {done.returncode}: {said}"}
+        return dict(codec.loads(done.stdout.splitlines()[-1]))
+
+
+def replayed_by(engines: list[str]) -> list[replays.Engine]:
+    """The engines in which kicks are replayed, with their engine steps; Brax does not take the human."""
+    return [
+        (engine, substeps)
+        for engine in engines
+        if engine != "brax"
+        for substeps in (*SUBSTEPS[engine], *MORE.get(engine, ()))
+    ]
+
+
+def price(engine: str, substeps: int, seed: int) -> Question:
+    """What a replay costs: a struck ball, at the middle batch."""
+    return Question(engine, "human_ball", "struck", substeps, MIDDLE, seed=seed)
+
+
+def kicks_of(engines: list[replays.Engine], count: int, seed: int) -> dict[str, partial[report.Row]]:
+    """The jobs of executed and replayed kicks, by name."""
+    kick = prepare()
+    planners = planners_of(kick, preset_of(PRESET), models_of(kick.scene, "larp", WEIGHTS))
+    random = np.random.default_rng(seed)
+
+    @cache
+    def players() -> dict[replays.Engine, replays.Player]:
+        found = {}
+        for engine, substeps in engines:
+            with suppress(Exception):  # its row of the speed says why
+                found[engine, substeps] = replays.player_of(kick.scene, engine, substeps)
+        return found
+
+    def one(target: np.ndarray, shift: np.ndarray, index: int) -> report.Row:
+        kicked = replays.executed(kick, planners, target, seed + index, shift)
+        return {"target": target.tolist(), "replays": replays.astray(kick.scene, kicked, players())}
+
+    return {f"kick {index}": partial(one, *random_task(random), index) for index in range(count)}
+
+
+def label(row: report.Row) -> str:
+    """An engine with its engine steps, as tables show it."""
+    return titled(row["engine"], row["substeps"])
+
+
+def speed_table(rows: list[report.Row], sizes: list[int]) -> Table:
+    """Microseconds per scene and step by batch; compilation and memory at the middle batch."""
+    table = Table("engine", "scene", *(f"{size}" for size in sizes), "compiled in", "memory", "launch error")
+    table.title = "Microseconds per scene and step of 10 ms, by batch"
+    groups: dict[tuple[str, str, bool], list[report.Row]] = {}
+    refusals: dict[tuple[str, str], dict[str, None]] = {}
+    for row in rows:
+        what = case(row["scene"], row["reach"])
+        groups.setdefault((label(row), what, row["gradient"]), []).append(row)
+    for (engine, what, gradient), found in groups.items():
+        done = {row["batch"]: row for row in found if row["refused"] is None}
+        if not done:
+            name = f"{engine}, gradient" if gradient else engine
+            refusals.setdefault((name, found[0]["refused"]), {})[what] = None
+            continue
+        middle = done[max([size for size in done if size <= MIDDLE] or done)]
+        launch = found[0].get("launch_error")
+        cells = {size: f"{row['us_per_scene_step']:.3g}" for size, row in done.items()}
+        if gradient:
+            cells = {size: f"{row['reverse_ms'] / row['forward_ms']:.1f} x forward" for size, row in done.items()}
+        seconds, extra = middle["compile_seconds"], middle["peak_memory_mib"] - middle["idle_memory_mib"]
+        table.add_row(
+            f"{engine}, gradient" if gradient else engine,
+            what,
+            *(cells.get(size, "-") for size in sizes),
+            f"{seconds:.1f} s" if seconds else "-",
+            f"{extra:.0f} MiB",
+            "-" if launch is None or gradient else f"{100 * launch:.1f} %",
+        )
+    for (engine, reason), cases in refusals.items():
+        table.add_row(engine, ", ".join(cases), reason, *[""] * (len(sizes) + 2))
+    return table
+
+
+def accuracy_table(found: list[report.Row]) -> Table:
+    """Errors of replayed kicks beside the price."""
+    table = Table("engine", "mean", "median", "launch error, median", "diverged", f"us, batch {MIDDLE}")
+    table.title = f"Ball's distance from MuJoCo's at {replays.LIMIT} engine steps, where it passes the target"
+
+    def cell(value: float | None, form: str) -> str:
+        return "-" if value is None else form.format(value)
+
+    for row in found:
+        table.add_row(
+            label(row),
+            cell(row["mean_m"], "{:.3f} m"),
+            cell(row["median_m"], "{:.3f} m"),
+            cell(row["launch_error"], "{:.1%}"),
+            f"{row['diverged']} of {row['kicks']}",
+            cell(row["us_per_scene_step"], "{:.3g}"),
+        )
+    return table
+
+
+def speed_picture(rows: list[report.Row]) -> Figure:
+    """Time per step over the number of simulations side by side, a panel a case."""
+    panels = list(dict.fromkeys((row["scene"], row["reach"]) for row in rows))
+    figure = Figure(figsize=(3.1 * len(panels) + 0.6, 4.4), layout="constrained")
+    drawn = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
+    shown: dict[str, Any] = {}
+    for axes, (scene, reach) in zip(drawn, panels, strict=True):
+        here = [row for row in rows if (row["scene"], row["reach"]) == (scene, reach) and row["refused"] is None]
+        for name, lines in curves([row for row in here if not row["gradient"]]).items():
+            text, line = draw(axes, name, lines)
+            shown.setdefault(text, line)
+        title = {"far": ", ball out of reach", "struck": ", ball struck"}.get(reach or "", "")
+        axes.set(
+            xscale="log", yscale="log", xlabel="simulations side by side", title=scene.replace("_", " and ") + title
+        )
+        axes.title.set_fontsize(11)
+        axes.grid(alpha=0.3, which="major")
+    drawn[0].set_ylabel("time per step of 10 ms [ms]")
+    figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=4, frameon=False)
+    return figure
+
+
+Curve = dict[int, float]
+
+
+def curves(rows: list[report.Row]) -> dict[str, dict[int, Curve]]:
+    """Milliseconds per step by engine, engine steps and batch."""
+    found: dict[str, dict[int, Curve]] = {}
+    for row in rows:
+        found.setdefault(row["engine"], {}).setdefault(row["substeps"], {})[row["batch"]] = row["ms_per_step"]
+    return found
+
+
+def draw(axes: Axes, engine: str, lines: dict[int, Curve]) -> tuple[str, Line2D]:
+    """An engine's line, with a band from its fewest to its most engine steps; returns its name and the line."""
+    colour, style = COLOURS[engine.split()[0]], STYLES.get(engine.split()[-1], "-")
+    substeps = CONVERGED if CONVERGED in lines else max(lines)
+    name = NAMES[engine] if engine == "larp" else f"{NAMES[engine]}, {substeps} engine steps"
+    if len(lines) > 1:
+        low, high = lines[min(lines)], lines[max(lines)]
+        shared = [size for size in low if size in high]
+        axes.fill_between(shared, [low[n] for n in shared], [high[n] for n in shared], color=colour, alpha=0.15, lw=0)
+        name += f" (band: {min(lines)} to {max(lines)})"
+    line = lines[substeps]
+    width = 2.5 if engine == "larp" else 1.5
+    (drawn,) = axes.plot(list(line), list(line.values()), style, marker="o", ms=4, color=colour, lw=width)
+    return name, drawn
+
+
+def accuracy_picture(found: list[report.Row]) -> Figure:
+    """Error over the time per scene and step; MuJoCo's points joined and named by their engine steps."""
+    figure = Figure(figsize=(7, 4.8), layout="constrained")
+    axes = figure.subplots()
+    priced = [row for row in found if None not in (row["us_per_scene_step"], row["mean_m"], row["median_m"])]
+    for engine in dict.fromkeys(row["engine"] for row in priced):
+        rows = [row for row in priced if row["engine"] == engine]
+        price = [row["us_per_scene_step"] for row in rows]
+        colour, mark = COLOURS[engine.split()[0]], "*" if engine == "larp" else "o"
+        for measure, style in (("mean_m", "--"), ("median_m", "-")):
+            error = [row[measure] for row in rows]
+            text = f"{NAMES[engine]}, {measure.removesuffix('_m')}"
+            size, face = (14, colour) if engine == "larp" else (6, colour)
+            if measure == "mean_m":
+                face = "white"
+            axes.plot(price, error, style, marker=mark, ms=size, mfc=face, color=colour, label=text)
+        for row in rows if engine != "larp" else ():
+            at = (row["us_per_scene_step"], row["median_m"])
+            axes.annotate(
+                str(row["substeps"]), at, (-4, -5), textcoords="offset points", ha="right", va="top", fontsize=9
+            )
+    axes.set(xscale="log", yscale="log", xlabel=f"time per scene and step of 10 ms, batch {MIDDLE} [us]")
+    axes.set(ylabel=f"ball's error at the target [m]\nagainst MuJoCo at {replays.LIMIT} engine steps")
+    axes.grid(alpha=0.3, which="major")
+    axes.legend(frameon=False)
+    return figure
+
+
+def main(
+    scenes: str = "ball,human,human_ball",
+    engines: str = "larp,mujoco,mjx,brax,bullet",
+    batch: str = "1,8,64,512,4096",
+    kicks: int = 32,
+    seed: int = 0,
+    json: Path = Path("runs/benchmarks/speed.json"),
+    publish: bool = False,
+) -> None:
+    """Time simulated steps and gradients of every engine, and replay executed kicks in each.
+
+    Args:
+        scenes: of ball, human and human_ball, with commas between them.
+        engines: of larp, mujoco, mjx, brax and bullet, with commas between them.
+        batch: simulations side by side, with commas between them.
+        kicks: how many are replayed; 0 for none. They need the scene human_ball.
+        seed: of joint targets, kicks and planner.
+        json: where the figures go; the pictures, speed.png and accuracy.png, go beside them.
+        publish: put the tables into RESULTS.md and the pictures into docs/.
+    """
+    asked, tried = listed("scenes", scenes, tuple(CASES)), listed("engines", engines, tuple(SUBSTEPS))
+    sizes = batches(batch)
+    if kicks < 0:
+        raise ValueError(f"kicks is {kicks}, but must be at least 0")
+    report.ready(json, publish)
+    remember_compilations()
+    again = replayed_by(tried) if kicks and "human_ball" in asked else []
+    ask = Asking()
+    each = [*questions(asked, tried, sizes, seed), *(price(*engine, seed) for engine in again)]
+    jobs = {question.name: partial(ask, question) for question in each}
+    played = kicks_of(again, kicks, seed) if again else {}
+    command = (
+        f"python -m tasks.benchmarks.speed --scenes {','.join(asked)} --engines {','.join(tried)} "
+        f"--batch {','.join(map(str, sizes))} --kicks {kicks} --seed {seed}"
+    )
+    rows = dict(zip([*jobs, *played], report.collect(json, command, jobs | played), strict=True))
+    found = replays.summarise(rows[name]["replays"] for name in played)
+    launch = {(row["engine"], row["substeps"]): row["launch_error"] for row in found}
+    for row in found:
+        row["us_per_scene_step"] = rows[price(row["engine"], row["substeps"], seed).name].get("us_per_scene_step")
+    times = [rows[name] | {"launch_error": launch.get((rows[name]["engine"], rows[name]["substeps"]))} for name in jobs]
+    report.write_json(
+        json,
+        {
+            "command": command,
+            "hardware": report.hardware(),
+            "rows": [row for row in times if not row["gradient"]],
+            "gradient": [row for row in times if row["gradient"]],
+            "replays": found,
+            "kicks": [rows[name] for name in played],
+        },
+    )
+    tables = {"speed": speed_table(times, sizes)}
+    pictures = {"speed": speed_picture(times)}
+    if found:
+        tables["accuracy_per_microsecond"] = accuracy_table(found)
+        pictures["accuracy"] = accuracy_picture(found)
+    for name, figure in pictures.items():
+        report.write_picture(json.with_name(f"{name}.png"), figure)
+        if publish:
+            report.write_picture(report.PICTURES / f"{name}.png", figure)
+    for name, table in tables.items():
+        report.show(table)
+        if publish:
+            report.publish(name, str(table.title), command, table)
+
+
+if __name__ == "__main__":
+    run(main)
