@@ -219,11 +219,12 @@ def speed_picture(rows: list[report.Row]) -> Figure:
         for name, lines in curves([row for row in here if not row["gradient"]]).items():
             text, line = draw(axes, name, lines)
             shown.setdefault(text, line)
-        title = {"far": ", ball out of reach", "struck": ", ball struck"}.get(reach or "", "")
-        axes.set(
-            xscale="log", yscale="log", xlabel="simulations side by side", title=scene.replace("_", " and ") + title
-        )
-        axes.title.set_fontsize(11)
+        where = {"far": ", ball out of reach", "struck": ", ball struck"}.get(reach or "", "")
+        axes.set(xscale="log", yscale="log", xlabel="simulations side by side")
+        axes.set_title(scene.replace("_", " and ") + where, fontsize=11)
+        sizes = sorted({row["batch"] for row in here})
+        axes.set_xticks(sizes, [str(size) for size in sizes], minor=False)
+        axes.minorticks_off()
         axes.grid(alpha=0.3, which="major")
     drawn[0].set_ylabel("time per step of 10 ms [ms]")
     figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=4, frameon=False)
