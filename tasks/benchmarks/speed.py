@@ -40,6 +40,8 @@ CASES = {
     "human_ball": (("human_ball", "far"), ("human_ball", "struck")),
 }
 DIFFERENTIABLE = ("larp", "mjx", "brax")
+# Engines that step one simulation after another, so that a larger batch tells nothing more.
+ALONE = ("bullet",)
 # Gradients are asked for up to this batch, accuracy beside the time at it, and memory is shown at it.
 MIDDLE = 512
 # A row's process is ended after so many seconds.
@@ -75,7 +77,7 @@ def questions(scenes: list[str], engines: list[str], sizes: list[int], seed: int
     cases = [each for scene in scenes for each in CASES[scene]]
     for engine in engines:
         for name, (scene, reach), substeps in product(variants(engine), cases, SUBSTEPS[engine]):
-            for size in sizes:
+            for size in sizes if engine not in ALONE else (1,):
                 yield Question(name, scene, reach, substeps, size, seed=seed)
     # Gradients compile for long, and planners take those of the learned simulator in their own scene: for all else,
     # one batch tells.
@@ -124,8 +126,8 @@ def replayed_by(engines: list[str]) -> list[replays.Engine]:
 
 
 def price(engine: str, substeps: int, seed: int) -> Question:
-    """What a replay costs: a struck ball, at the middle batch."""
-    return Question(engine, "human_ball", "struck", substeps, MIDDLE, seed=seed)
+    """What a replay costs: a struck ball, at the middle batch where the engine has batches."""
+    return Question(engine, "human_ball", "struck", substeps, 1 if engine in ALONE else MIDDLE, seed=seed)
 
 
 def kicks_of(engines: list[replays.Engine], count: int, seed: int) -> dict[str, partial[report.Row]]:
