@@ -95,16 +95,20 @@ def test_a_process_that_dies_becomes_a_row_that_says_so(monkeypatch: pytest.Monk
     assert "code 1" in speed.Asking()(asked())["refused"]
 
 
-def test_what_an_engine_refused_is_not_asked_again_with_a_larger_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("row", [{"refused": "needs more"}, {"refused": None, "ms_per_step": 1e4}])
+def test_what_an_engine_refused_or_is_slow_at_is_not_asked_again_with_a_larger_batch(
+    row: report.Row, monkeypatch: pytest.MonkeyPatch
+) -> None:
     sizes: list[int] = []
 
-    def refuse(self: speed.Asking, question: Question) -> report.Row:
+    def answer(self: speed.Asking, question: Question) -> report.Row:
         sizes.append(question.batch)
-        return {"refused": "needs more"}
+        return row
 
-    monkeypatch.setattr(speed.Asking, "asked", refuse)
+    monkeypatch.setattr(speed.Asking, "asked", answer)
     ask = speed.Asking()
-    assert [ask(asked(batch=batch))["refused"] for batch in (8, 64)] == ["needs more"] * 2
+    found = [ask(asked(batch=batch))["refused"] for batch in (8, 64, 512)]
+    assert found[0] == row["refused"] and found[1] is not None and found[1] == found[2]
     assert sizes == [8]
 
 

@@ -44,8 +44,8 @@ DIFFERENTIABLE = ("larp", "mjx", "brax")
 ALONE = ("bullet",)
 # Gradients are asked for up to this batch, accuracy beside the time at it, and memory is shown at it.
 MIDDLE = 512
-# A row's process is ended after so many seconds.
-SECONDS = 300.0
+# A row's process is ended after so many seconds. Where a step takes so many, larger batches are not asked for.
+SECONDS, SLOW = 300.0, 2.5
 PRESET = "fast"
 STYLES = {"spring": "--", "positional": ":"}
 COLOURS = {"larp": "#d55e00", "mujoco": "#0072b2", "mjx": "#009e73", "brax": "#cc79a7", "bullet": "#7f7f7f"}
@@ -89,7 +89,10 @@ def questions(scenes: list[str], engines: list[str], sizes: list[int], seed: int
 
 
 class Asking:
-    """Asks each question in a process of its own; what an engine refused, it is not asked again with a larger batch."""
+    """Asks each question in a process of its own.
+
+    What an engine refused or is slow at, it is not asked again with a larger batch.
+    """
 
     def __init__(self) -> None:
         self.refused: dict[Question, str] = {}
@@ -100,6 +103,8 @@ class Asking:
         row |= {"refused": self.refused[same]} if same in self.refused else self.asked(question)
         if row["refused"] is not None:
             self.refused[same] = row["refused"]
+        elif row["ms_per_step"] > 1e3 * SLOW:
+            self.refused[same] = f"takes {1e-3 * row['ms_per_step']:.1f} s a step at batch {question.batch}"
         return row
 
     def asked(self, question: Question) -> report.Row:
