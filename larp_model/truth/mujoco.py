@@ -6,6 +6,8 @@ A step of `scene.dt` takes several engine steps, because the engine's usual step
 
 from __future__ import annotations
 
+import os
+
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
@@ -94,15 +96,20 @@ def _add_pair(spec: mujoco.MjSpec, first: str, second: str, surface: Surface) ->
     pair.friction[:2] = max(surface.friction, 1e-5)
 
 
+def cores() -> int:
+    """How many processors this process may use; the engine's own default counts those that it may not, too."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class Truth:
     """A batch of simulations of one scene."""
 
     def __init__(self, scene: Scene, batch: int = 1, substeps: int = SUBSTEPS, threads: int = 0) -> None:
-        """batch: simulations side by side. substeps: engine steps in one `scene.dt`. threads: 0 takes all cores."""
+        """batch: simulations side by side. substeps: engine steps in one `scene.dt`. threads: 0 takes all `cores`."""
         self.scene = scene
         self.substeps = substeps
         self.model = compile_model(scene, substeps)
-        self._batch = Batch(self.model, nsim=batch, nthread=threads)
+        self._batch = Batch(self.model, nsim=batch, nthread=threads or cores())
         self._sensors = self._batch.bind("sensordata")  # refreshed by every call from here on
         self._joint = {name: self.model.joint(name).id for name in self._names()}
         self._bodies = [self.model.body(name).id for name in self._names()]  # the engine lists bodies depth first

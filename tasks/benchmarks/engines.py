@@ -228,8 +228,8 @@ def bullet(scene: Scene, substeps: int, batch: int) -> BatchedTruth:
 
 
 def mujoco(scene: Scene, substeps: int, batch: int) -> BatchedTruth:
-    """The truth, on as many threads as this process has cores."""
-    return Truth(scene, batch, substeps, threads=report.cores())
+    """The truth, on all cores."""
+    return Truth(scene, batch, substeps)
 
 
 TRACED: dict[str, Callable[[Scene, int], Traced]] = {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import platform
 import re
 import time
@@ -19,6 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from larp_model.files import require_writable, write_whole, written_whole
+from larp_model.truth.mujoco import cores
 
 RESULTS = Path("RESULTS.md")
 # Pictures that the README shows.
@@ -86,11 +86,6 @@ def version() -> str:
                 digest.update(file.relative_to(PROJECT).as_posix().encode())
                 digest.update(file.read_bytes())
     return digest.hexdigest()[:16]
-
-
-def cores() -> int:
-    """How many processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def hardware() -> str:
