@@ -44,6 +44,7 @@ def compliance(scene: Scene, rows: np.ndarray, matrices: Array, points: Array, s
     """
     joints = {child: (parent, joint) for child, parent, joint in scene.joints()}
     stiff: dict[int, Array] = {}  # (G_jj + W_p)^-1 by link
+    identity = jnp.eye(3, dtype=matrices.dtype)
 
     def inertia(row: int) -> tuple[Array, Array]:
         """1/m (B, 1, 1) and I^-1 (B, 3, 3)."""
@@ -53,28 +54,29 @@ def compliance(scene: Scene, rows: np.ndarray, matrices: Array, points: Array, s
         along, across = (along + held)[..., None, None], (across + held)[..., None, None]
         axis = matrices[..., row, :, :] @ jnp.asarray(scene.links[row].axis, matrices.dtype)
         outer = axis[..., :, None] * axis[..., None, :]
-        return 1.0 / mass[..., None, None], (jnp.eye(3) - outer) / across + outer / along
+        return 1.0 / mass[..., None, None], (identity - outer) / across + outer / along
 
     def place(row: int, point: tuple[float, float, float]) -> Array:
         axis = np.asarray(scene.links[row].axis)
         along = axis @ point * axis
-        offset = 0.5 * shape[..., row, 0:1] * along + shape[..., row, 1:2] * (np.asarray(point) - along)
+        along, across = (np.asarray(part, matrices.dtype) for part in (along, np.asarray(point) - along))
+        offset = 0.5 * shape[..., row, 0:1] * along + shape[..., row, 1:2] * across
         return jnp.sum(matrices[..., row, :, :] * offset[..., None, :], axis=-1)
 
     def yields(row: int, point: Array) -> Array:
         """W at a point (B, 3) of a link."""
         lightness, inverse = inertia(row)
         cross_point = skew(point)
-        free = lightness * jnp.eye(3) - cross_point @ inverse @ cross_point
+        free = lightness * identity - cross_point @ inverse @ cross_point
         if row not in joints:
             return free
         parent, joint = joints[row]
         arm = place(row, joint.child_anchor)
         cross_arm = skew(arm)
         if row not in stiff:
-            at_arm = lightness * jnp.eye(3) - cross_arm @ inverse @ cross_arm
+            at_arm = lightness * identity - cross_arm @ inverse @ cross_arm
             stiff[row] = invert(at_arm + yields(parent, place(parent, joint.parent_anchor)))
-        across = lightness * jnp.eye(3) - cross_point @ inverse @ cross_arm
+        across = lightness * identity - cross_point @ inverse @ cross_arm
         return free - across @ stiff[row] @ jnp.swapaxes(across, -1, -2)
 
     return jnp.stack([yields(int(row), points[..., index, :]) for index, row in enumerate(rows)], axis=-3)

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from larp_model import contact, features, rotation
@@ -133,7 +134,7 @@ def contacts(scene: Scene, config: Config, weights: Weights, state: Array, free:
     for pair in scene.pairs:
         name = contact_name(scene, pair)
         first, second = features.pair_rows(scene, pair)
-        to_first, to_second = jax.nn.one_hot(first, links), jax.nn.one_hot(second, links)
+        to_first, to_second = (jax.nn.one_hot(rows, links, dtype=state.dtype) for rows in (first, second))
         network = partial(evaluate, contact_network(config), weights, name)
         if config.contact == "feature":
             inputs = features.paper_contact_inputs(scene, pair, state, shape)
@@ -217,7 +218,7 @@ def step(
         rows = scene.rows(body.name)
         if by_scalars(config, body):
             own_pooled = Pooled(pooled.feature[:, rows], pooled.travel[:, rows])
-            ball = ball_step(scene, config, weights, body, state[:, rows], own_pooled, shape[:, rows])
+            ball = ball_step(scene, config, weights, body, state[:, rows], own_pooled, torque[:, rows], shape[:, rows])
             after = after.at[:, rows].set(ball)
     return after
 
@@ -325,9 +326,10 @@ def changes(config: Config, state: Array, after: Array, dt: float) -> Array:
 
 
 def ball_step(
-    scene: Scene, config: Config, weights: Weights, body: Body, state: Array, pooled: Pooled, shape: Array
-) -> Array:
-    """One step of a ball (B, 1, 13): free flight, the impulses of its contacts, and a learned bounce and slide.
+    scene: Scene, config: Config, weights: Weights, body: Body, state: Array, pooled: Pooled, torque: Array,
+    shape: Array,
+) -> Array:  # fmt: skip
+    """One step of a ball (B, 1, 13): free flight, contacts' impulses, torque (B, 1, 3), a learned bounce and slide.
 
     Away from every contact it is exact free flight.
     """
@@ -346,7 +348,7 @@ def ball_step(
     lag = ground.bounce.lag[:, None] + 0.001 * late
     slide = -stick * ground.slip - drag * along
     new_velocity = velocity - scene.gravity * dt * up + kick + bounce * up + slide
-    moment = impulse[:, 3:] / (SPHERE * mass * radius**2)
+    moment = (impulse[:, 3:] + dt * torque[:, 0]) / (SPHERE * mass * radius**2)
     rolling = (grip * jnp.cross(up, ground.slip) + roll * jnp.cross(up, along)) / (SPHERE * radius)
     new_spin = spin + moment + rolling - twist * spin * up
     moved = (
@@ -373,8 +375,9 @@ class Simulator:
     differentiable = True
 
     def step(self, state: Array, control: Array, torque: Array | None = None, shape: Array | None = None) -> Array:
-        """States (N, L, 13) after one `scene.dt` under controls (N, J, 3) [rad]."""
-        return step(self.scene, self.config, self.weights, state, control, torque, shape)
+        """States (N, L, 13) after one `scene.dt` under controls (N, J, 3) [rad]; see `rollout` for the rest."""
+        given = self._checked(state, control, torque, shape, ())
+        return step(self.scene, self.config, self.weights, *given)
 
     def rollout(
         self, state: Array, controls: Array, steps: Array | None = None, torques: Array | None = None,
@@ -383,14 +386,32 @@ class Simulator:
         """States (N, H, L, 13) after each of H steps from states (N, L, 13) under controls (N, H, J, 3) [rad].
 
         steps (): so many of the H are computed, the rest repeat the last; all by default. torques: external, (N, H, L,
-        3) [N m]. shape: morphology (N or 1, L, 3); the scene's by default.
+        3) [N m]. shape: morphology (N or 1, L, 3); the scene's by default. All are taken in the state's precision, 32
+        or 64 bits. Positions in 32 bits are 0.1 mm apart 1 km from the origin: plan near it.
         """
-        links, motors = len(self.scene.links), len(self.scene.motors)
+        given = self._checked(state, controls, torques, shape, np.shape(controls)[1:2])
+        return rollout(self.scene, self.config, self.weights, *given, steps=steps)
+
+    def _checked(
+        self, state: Array, control: Array, torque: Array | None, shape: Array | None, steps: tuple[int, ...]
+    ) -> tuple[Array, Array, Array | None, Array | None]:
+        """The public arguments as JAX arrays, refused by name where they do not fit; steps: (H,) or none."""
+        state, links, motors = jnp.asarray(state), len(self.scene.links), len(self.scene.motors)
         if state.ndim != 3 or state.shape[1:] != (links, packed.SIZE):
             raise ValueError(f"state has shape {state.shape}, but needs (N, {links}, {packed.SIZE})")
-        if controls.ndim != 4 or controls.shape[0] != state.shape[0] or controls.shape[2:] != (motors, 3):
-            raise ValueError(f"controls have shape {controls.shape}, but need ({state.shape[0]}, H, {motors}, 3)")
-        return rollout(self.scene, self.config, self.weights, state, controls, torques, shape, steps=steps)
+        if state.dtype not in (jnp.float32, jnp.float64):
+            raise ValueError(f"state has numbers of type {state.dtype}, but needs float32 or float64")
+        needed = {
+            "controls": (control, (len(state), *steps, motors, 3)),
+            "torques": (torque, (len(state), *steps, links, 3)),
+        }
+        for name, (value, size) in needed.items():
+            if value is not None and np.shape(value) != size:
+                raise ValueError(f"{name} have shape {np.shape(value)}, but need {size}")
+        if shape is not None and np.shape(shape) not in ((1, links, 3), (len(state), links, 3)):
+            raise ValueError(f"shape has shape {np.shape(shape)}, but needs ({len(state)} or 1, {links}, 3)")
+        torque, shape = (None if value is None else jnp.asarray(value, state.dtype) for value in (torque, shape))
+        return state, jnp.asarray(control, state.dtype), torque, shape
 
 
 def rollout(

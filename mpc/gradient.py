@@ -17,6 +17,11 @@ class Gradient:
     Unlike there, every candidate is scored again after its steps, and the cheapest knots on its way are kept:
     a step that lands badly costs time, never quality. Where a gradient is not finite its candidate stands
     still.
+
+    The gradient of a long rollout through contact is true and still of little use: a learned ball on the ground turns a
+    height of 1 mm into 10 rad/s within a step, and such factors multiply. Of kicks drawn around the reference the
+    median is some 20 per spread, one in ten beyond 1e4, the largest seen 1e29. `clip` holds each knot's part:
+    the direction is kept, the size is not believed.
     """
 
     steps: int = 4
@@ -72,8 +77,11 @@ class Gradient:
         scaled = gradient * search.scale
         usable = jnp.all(jnp.isfinite(scaled), axis=(1, 2, 3), keepdims=True)
         scaled = jnp.where(usable, scaled, 0.0)
+        # Against the clip squared, a large gradient would overflow: divide by its largest component first.
+        largest = jnp.maximum(jnp.max(jnp.abs(scaled), axis=(2, 3), keepdims=True), self.clip)
+        scaled = scaled / largest
         norm = jnp.sqrt(jnp.sum(scaled**2, axis=(2, 3), keepdims=True))
-        step, memory = self._optimizer.update(scaled * self.clip / jnp.maximum(norm, self.clip), memory)
+        step, memory = self._optimizer.update(scaled * self.clip / jnp.maximum(norm, self.clip / largest), memory)
         return knots + step * search.scale, memory
 
     @property

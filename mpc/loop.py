@@ -19,7 +19,11 @@ class World(Protocol):
         """Put the world into states (1, L, 13)."""
 
     def step(self, control: np.ndarray) -> np.ndarray:
-        """States (1, L, 13) after one step under joint targets (1, J, 3) [rad]."""
+        """States (1, L, 13) after one step under joint targets (1, J, 3) [rad]; NaN where it diverged."""
+
+
+class Diverged(ValueError):
+    """The world's state is no longer finite: nothing that was executed from here on would mean anything."""
 
 
 class Window(NamedTuple):
@@ -88,7 +92,8 @@ def execute(
     """Plan in the true state, from state (L, 13) on, execute and plan again, one phase after the other.
 
     After the last phase its plan is carried out, and after the plan's end the task's reference. `observe` is called
-    after every step. sense: what the planners are shown of a true state (L, 13); all of it by default.
+    after every step. sense: what the planners are shown of a true state (L, 13); all of it by default. Raises
+    `Diverged` as soon as the world does.
     """
     world.reset(state[None])
     execution = Execution([np.asarray(state)])
@@ -114,6 +119,10 @@ def execute(
         ahead = step - planned_at
         control = targets[ahead] if ahead < len(targets) else phase.window(step).controls[0]
         execution.controls.append(control)
-        execution.states.append(world.step(control[None])[0])
+        after = world.step(control[None])[0]
+        if not np.isfinite(after).all():
+            cause = "" if np.isfinite(control).all() else ": the joint targets are not finite"
+            raise Diverged(f"the world diverged in step {step}{cause}")
+        execution.states.append(after)
         observe(execution)
     return execution

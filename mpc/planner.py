@@ -297,7 +297,7 @@ class Planner:
 def _array(value: ArrayLike) -> jax.Array:
     """A JAX array of 32 bits whose type does not depend on whether a Python or a NumPy number came in."""
     array = np.asarray(value)
-    return jnp.asarray(array, jnp.float32 if np.issubdtype(array.dtype, np.floating) else None)
+    return jnp.asarray(array, jnp.float32 if jnp.issubdtype(array.dtype, jnp.floating) else None)
 
 
 def _broadcast(name: str, value: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:

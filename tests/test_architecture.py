@@ -73,6 +73,8 @@ ORDER = [
     "tasks.benchmarks.replays",
     "tasks.benchmarks.speed",
     "tasks.benchmarks.tradeoff",
+    "tasks.benchmarks.pushes",
+    "tasks.benchmarks.slopes",
     "tasks.benchmarks.stability",
     "tasks.benchmarks",
     "tasks",

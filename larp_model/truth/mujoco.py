@@ -162,13 +162,15 @@ class Truth:
     def step(self, control: np.ndarray, torque: np.ndarray | None = None) -> np.ndarray:
         """Advance by `scene.dt` under joint targets (N, J, 3) [rad] and torques on links (N, L, 3) [N m], world frame.
 
-        Returns the packed states (N, L, 13).
+        Returns the packed states (N, L, 13), NaN for those beyond `LIMITS`.
         """
         self._batch.bind("ctrl")[:] = np.asarray(control).reshape(self.batch, -1)
         if torque is not None:
             self._batch.bind("xfrc_applied").reshape(self.batch, -1, 6)[:, self._bodies, 3:] = torque
         self._batch.step(nstep=self.substeps, stage=mujoco.mjtStage.mjSTAGE_VEL)
-        return self.state()
+        states = self.state()
+        states[~finite(states[:, None])] = np.nan
+        return states
 
     def rollout(
         self, states: np.ndarray, controls: np.ndarray, torques: np.ndarray | None = None

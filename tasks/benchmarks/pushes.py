@@ -1,0 +1,625 @@
+"""What the learned simulator and the engine are pushed through: sizes, states, precision, batches, horizons, scenes.
+
+Every function gives rows {axis, value, promise, seen, held}; a promise is a number that can be missed.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from larp_model import contact, features
+from larp_model import state as packed
+from larp_model.bodies import KICKING_LINKS, ball, capsule, chain, human
+from larp_model.networks import Config
+from larp_model.scene import Pair, Scene
+from larp_model.simulator import Simulator, initial_weights, measure
+from larp_model.truth.mujoco import Truth
+from mpc import CostTerm, evaluate
+from tasks.benchmarks.report import Row
+from tasks.kick import Kick
+
+STEPS = 48
+# No link of a kick is ever faster [m/s]; MuJoCo's trajectories count as diverged beyond it.
+FASTEST = 100.0
+FACTORS = (0.1, 0.2, 0.5, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 2.0, 5.0, 10.0)
+# How far the links may on average be from the engine's over 48 steps [m], and joints from being closed.
+NEAR_TRUTH, CLOSED = 0.10, 0.05
+KINDS = (
+    "ball",
+    "two balls",
+    "capsule",
+    "capsule and ball",
+    "two capsules",
+    "chain",
+    "chain and ball",
+    "human",
+    "human and ball",
+    "two humans",
+)
+# The least network that has all parts: its weights are random, its geometry and physics are real.
+TINY = Config("tiny", 2, 16, 2, 16, 2, 16, "heading", "change", "impulse", skip=True, aided=True)
+
+
+class Bench(NamedTuple):
+    """What is pushed: the kick's task and the learned simulator of its scene."""
+
+    kick: Kick
+    model: Simulator
+
+    @property
+    def controls(self) -> np.ndarray:
+        """The reference's joint targets (48, J, 3) [rad]."""
+        return self.kick.reference.window(0, STEPS)[1]
+
+
+def row(axis: str, value: Any, promise: str, seen: str, held: bool) -> Row:
+    """One case."""
+    return {"axis": axis, "value": str(value), "promise": promise, "seen": seen, "held": bool(held)}
+
+
+def fastest(states: np.ndarray) -> float:
+    """The greatest speed [m/s] in states (*, L, 13); NaN where one is not finite."""
+    return float(np.linalg.norm(np.asarray(states, float)[..., packed.VELOCITY], axis=-1).max())
+
+
+def bounded(axis: str, value: Any, states: np.ndarray) -> Row:
+    """Whether a trajectory (H, L, 13) stays finite, slow enough and rotated by rotations."""
+    speed = fastest(states)
+    length = np.linalg.norm(np.asarray(states, float)[..., packed.ORIENTATION], axis=-1)
+    unit = float(np.abs(length - 1.0).max())
+    held = bool(np.isfinite(states).all() and speed <= FASTEST and unit <= 1e-3)
+    promise = f"LARP: finite, quaternions of unit length, no link beyond {FASTEST:g} m/s in {STEPS} steps"
+    return row(axis, value, promise, f"fastest {speed:.3g} m/s, quaternions off by {unit:.0e}", held)
+
+
+def flagged(axis: str, value: Any, states: np.ndarray, flag: bool) -> Row:
+    """Whether the engine says so where a trajectory (H, L, 13) is not finite."""
+    whole = bool(np.isfinite(states).all())
+    seen = "finite, not flagged" if whole and flag else "flagged" if not flag else "not finite and not flagged"
+    return row(axis, value, "MuJoCo: finite, or flagged as diverged", seen, whole or not flag)
+
+
+# Sizes.
+
+
+def scaled(scene: Scene, body: str, field: str, factor: float) -> Scene:
+    """The scene with one size of all links of a body times a factor; motors and surfaces stay."""
+
+    def resized(each: Any) -> Any:
+        if each.name != body:
+            return each
+        return replace(
+            each, links=tuple(replace(link, **{field: factor * getattr(link, field)}) for link in each.links)
+        )
+
+    return replace(scene, bodies=tuple(resized(each) for each in scene.bodies))
+
+
+def standing(scene: Scene, state: np.ndarray) -> np.ndarray:
+    """A state (L, 13) with its joints closed for this scene, the human's lowest link and the ball on the ground."""
+    state = state.copy()
+    radius = scene.links[-1].radius
+    state[-1, 0] += max(radius - 0.11, 0.0)
+    truth = Truth(scene, 1, threads=1)
+    truth.reset(state[None])
+    state = truth.state()[0]
+    turned = Rotation.from_quat(state[:, packed.ORIENTATION], scalar_first=True)
+    half = turned.apply([0.5 * link.length * np.asarray(link.axis) for link in scene.links])
+    lowest = state[:, 2] - np.abs(half[:, 2]) - [link.radius for link in scene.links]
+    state[:-1, 2] -= lowest[:-1].min()
+    state[-1, 2] = radius
+    return state
+
+
+def sizes(bench: Bench, body: str, field: str) -> list[Row]:
+    """One size of the human or the ball, from a tenth to ten times what the weights have seen."""
+    scene, rows = bench.kick.scene, bench.kick.scene.rows(body)
+    scenes = [scaled(scene, body, field, factor) for factor in FACTORS]
+    starts = np.stack([standing(each, bench.kick.start()) for each in scenes])
+    controls = np.broadcast_to(bench.controls, (len(FACTORS), *bench.controls.shape))
+    shape = jnp.stack([features.morphology(each) for each in scenes])
+    states = np.asarray(jax.jit(bench.model.rollout)(starts, controls, shape=shape))
+    apart = np.asarray(jax.jit(lambda s: features.displacement(scene, s, shape[:, None]))(jnp.asarray(states)))
+    errors, found = [], []
+    for index, (factor, each) in enumerate(zip(FACTORS, scenes, strict=True)):
+        true, flags = Truth(each, 1, threads=1).rollout(starts[index][None], controls[index][None])
+        distance = np.linalg.norm((states[index] - true[0])[:, rows, packed.POSITION], axis=-1)
+        errors.append(float(distance.mean()) if flags[0] else np.inf)
+        if factor in (0.1, 0.2, 0.5, 2.0, 5.0, 10.0):
+            found.append(bounded(f"{body} {field}", f"x {factor:g}", states[index]))
+            found.append(flagged(f"{body} {field}", f"x {factor:g}", true[0], bool(flags[0])))
+            if body == "human":
+                opened = float(np.linalg.norm(apart[index], axis=-1).max())
+                promise = f"LARP: joints stay closed within {100 * CLOSED:g} cm for {STEPS} steps"
+                seen = f"{100 * opened:.3g} cm"
+                found.append(row(f"{body} {field}", f"x {factor:g}", promise, seen, opened <= CLOSED))
+    within = [error <= NEAR_TRUTH for error in errors]
+    unit = FACTORS.index(1.0)
+    low = unit - next((n for n, held in enumerate(within[unit::-1]) if not held), unit + 1) + 1
+    high = unit + next((n for n, held in enumerate(within[unit:]) if not held), len(FACTORS) - unit) - 1
+    limit = f"holds from x {FACTORS[low]:g} to x {FACTORS[high]:g}" if within[unit] else "holds nowhere"
+    promise = f"LARP: links of the {body} within {100 * NEAR_TRUTH:g} cm of MuJoCo's on average over {STEPS} steps"
+    for factor, error, held in zip(FACTORS, errors, within, strict=True):
+        if factor in (0.1, 0.5, 0.8, 1.25, 2.0, 10.0):
+            found.append(row(f"{body} {field}", f"x {factor:g}", promise, f"{100 * error:.3g} cm; {limit}", held))
+    return found
+
+
+# States.
+
+Law = Callable[[np.ndarray, np.ndarray], tuple[str, str, bool]]
+
+
+class Case(NamedTuple):
+    """A start (L, 13) with targets (48, J, 3) [rad] and torques on all links (3,) [N m], and what it must keep."""
+
+    axis: str
+    value: str
+    state: np.ndarray
+    controls: np.ndarray
+    torque: float = 0.0
+    law: Law | None = None
+
+
+def keeps_energy(scene: Scene) -> Law:
+    """The last body, a ball that touches only the ground, never has more energy than at the start."""
+    mass, radius = scene.links[-1].mass, scene.links[-1].radius
+
+    def energy(states: np.ndarray) -> np.ndarray:
+        moving = (states[..., -1, packed.VELOCITY] ** 2).sum(-1) + 0.4 * radius**2 * (
+            states[..., -1, packed.ANGULAR_VELOCITY] ** 2
+        ).sum(-1)
+        return 0.5 * mass * moving + mass * scene.gravity * states[..., -1, 2]
+
+    def law(start: np.ndarray, states: np.ndarray) -> tuple[str, str, bool]:
+        gained = float((energy(states) / energy(start)).max() - 1.0)
+        return "LARP: the ball gains no energy, within 2 %", f"{100 * gained:+.2g} %", gained <= 0.02
+
+    return law
+
+
+def cases(kick: Kick, controls: np.ndarray) -> list[Case]:
+    """Starts that no kick has, each with what is varied."""
+    scene, base = kick.scene, kick.start()
+    base[-1, :2] = 3.0, 0.0
+    found: list[Case] = []
+    lower, upper = kick.lower, kick.upper
+    random = np.random.default_rng(0)
+    toss = random.standard_normal((len(base) - 1, 3))
+    toss /= np.linalg.norm(toss, axis=-1, keepdims=True)
+
+    def add(axis: str, value: str, change: Callable[[np.ndarray], None], **rest: Any) -> None:
+        state = base.copy()
+        change(state)
+        found.append(Case(axis, value, state, rest.pop("targets", controls), **rest))
+
+    def put(rows: Any, columns: Any, value: Any) -> Callable[[np.ndarray], None]:
+        return lambda state: state.__setitem__((rows, columns), value)
+
+    law, links = keeps_energy(scene), slice(0, -1)
+    for speed in (5.0, 10.0, 20.0, 50.0):
+
+        def fall(state: np.ndarray, speed: float = speed) -> None:
+            state[-1, 2], state[-1, packed.VELOCITY] = 1.0, (0.3 * speed, 0.0, -speed)
+
+        add("ball speed at the ground", f"{speed:g} m/s", fall, law=law)
+
+        def shot(state: np.ndarray, speed: float = speed) -> None:
+            place = state[kick.foot, packed.POSITION]
+            state[-1, packed.POSITION] = place + np.array([0.5, 0.0, 0.05])
+            state[-1, packed.VELOCITY] = -speed, 0.0, 0.0
+
+        add("ball speed at the foot", f"{speed:g} m/s", shot)
+        add("speed of every link", f"{speed:g} m/s", put(links, packed.VELOCITY, (0.6 * speed, 0.0, 0.8 * speed)))
+    for spin in (10.0, 50.0, 100.0, 200.0):
+        add("ball spin on the ground", f"{spin:g} rad/s", put(-1, packed.ANGULAR_VELOCITY, (0.0, spin, 0.0)), law=law)
+        add("spin of every link", f"{spin:g} rad/s", put(links, packed.ANGULAR_VELOCITY, spin * toss))
+    nothing = lambda state: None  # noqa: E731
+    for torque in (10.0, 100.0, 1e3, 1e4):
+        add("torque on every link", f"{torque:g} N m", nothing, torque=torque)
+    for name, bound in (("lower", lower), ("upper", upper)):
+        for factor in (1.0, 2.0, 5.0):
+            targets = np.broadcast_to(factor * bound, controls.shape)
+            add("joint targets", f"{factor:g} x {name} limit", nothing, targets=targets)
+    for angle in (np.pi, 2.0 * np.pi, 100.0):
+        add("joint targets", f"{angle:.3g} rad about every axis", nothing, targets=np.full(controls.shape, angle))
+    for depth in (0.01, 0.05, 0.1):
+        add("ball inside the foot", f"{100 * depth:g} cm", _into_foot(kick, depth))
+    add("ball inside the foot", "centres coincide", lambda s: s[-1].__setitem__(packed.POSITION, s[kick.foot, :3]))
+    add("ball inside the pelvis", "centres coincide", lambda s: s[-1].__setitem__(packed.POSITION, s[0, :3]))
+    for depth in (0.05, 0.11, 0.5):
+        add("ball inside the ground", f"{100 * depth:g} cm", put(-1, 2, scene.links[-1].radius - depth))
+    for depth in (0.05, 0.2, 1.0):
+        add("human inside the ground", f"{100 * depth:g} cm", partial(_lift, -depth))
+    for height in (1.0, 10.0, 100.0):
+        add("human above the ground", f"{height:g} m", partial(_lift, height))
+    add("all links in one place", "1 m up", put(slice(None), packed.POSITION, (0.0, 0.0, 1.0)))
+    add("human on its head", "pelvis turned by pi", _upside_down)
+    for scale in (-1.0, 0.5, 2.0):
+
+        def stretch(state: np.ndarray, scale: float = scale) -> None:
+            state[:, packed.ORIENTATION] *= scale
+
+        add("length of quaternions", f"x {scale:g}", stretch)
+    return found
+
+
+def _into_foot(kick: Kick, depth: float) -> Callable[[np.ndarray], None]:
+    reach = kick.scene.links[kick.foot].radius + kick.scene.links[-1].radius - depth
+    return lambda s: s[-1].__setitem__(packed.POSITION, s[kick.foot, :3] + (0.0, -reach, 0.0))
+
+
+def _lift(height: float, state: np.ndarray) -> None:
+    state[:-1, 2] += height
+
+
+def _upside_down(state: np.ndarray) -> None:
+    turn = Rotation.from_rotvec([np.pi, 0.0, 0.0])
+    root = state[0, :3].copy()
+    state[:-1, :3] = turn.apply(state[:-1, :3] - root) + root
+    old = Rotation.from_quat(state[:-1, packed.ORIENTATION], scalar_first=True)
+    state[:-1, packed.ORIENTATION] = (turn * old).as_quat(scalar_first=True)
+    state[:-1, 2] += 0.5
+
+
+def wild_states(bench: Bench) -> list[Row]:
+    """All `cases`, in LARP and in MuJoCo."""
+    scene = bench.kick.scene
+    every = cases(bench.kick, bench.controls)
+    states = np.stack([case.state for case in every])
+    controls = np.stack([case.controls for case in every])
+    torques = np.zeros((len(every), STEPS, len(scene.links), 3))
+    torques[:, :, :, 1] = np.array([case.torque for case in every])[:, None, None]
+    learned = np.asarray(jax.jit(lambda s, u, t: bench.model.rollout(s, u, torques=t))(states, controls, torques))
+    true, flags = Truth(scene, len(every)).rollout(states, controls, torques)
+    found = []
+    for case, start, mine, theirs, flag in zip(every, states, learned, true, flags, strict=True):
+        found.append(bounded(case.axis, case.value, mine))
+        if case.law:
+            found.append(row(case.axis, case.value, *case.law(start, mine)))
+        found.append(flagged(case.axis, case.value, theirs, bool(flag)))
+    return found
+
+
+def far_and_lost(bench: Bench) -> list[Row]:
+    """A ball very far away, and states that are not finite: neither may touch what it has no part in."""
+    kick, human = bench.kick, bench.kick.human
+    distances = (10.0, 1e3, 1e6, 1e12, 1e20, 1e30)
+    base = kick.start().astype(np.float32)
+    base[-1, :2] = 3.0, 0.0
+    states = np.tile(base, (len(distances) + 5, 1, 1))
+    for index, distance in enumerate(distances):
+        states[index, -1, 0] = distance
+    lost: dict[str, tuple[Any, Any, float]] = {
+        "NaN in the ball's place": (-1, 0, np.nan),
+        "infinite speed of the ball": (-1, 7, np.inf),
+    }
+    lost |= {
+        "NaN in a thigh's spin": (7, 10, np.nan),
+        "quaternions of length 0": (slice(None), packed.ORIENTATION, 0.0),
+    }
+    for index, (rows, columns, value) in enumerate(lost.values(), start=len(distances)):
+        states[index, rows, columns] = value
+    controls = np.broadcast_to(bench.controls, (len(states), *bench.controls.shape))
+    run = jax.jit(bench.model.rollout)
+    after = np.asarray(run(states, controls))
+    alone = np.asarray(run(np.tile(base, (len(states), 1, 1)), controls))
+    apart = np.abs(after - alone)[..., packed.POSITION].max(axis=(1, 3))  # (N, L)
+    found = []
+    for index, distance in enumerate(distances):
+        moved, whole = float(apart[index][human].max()), bool(np.isfinite(after[index]).all())
+        promise = f"LARP: the human within 1 mm of where it is with a ball 3 m away, {STEPS} steps; or not finite"
+        seen = f"{1e3 * moved:.2g} mm" if whole else "not finite"
+        found.append(row("ball far away", f"{distance:g} m", promise, seen, moved <= 1e-3 or not whole))
+    beside = float(apart[-1].max())
+    for index, name in enumerate(lost, start=len(distances)):
+        whole = bool(np.isfinite(after[index]).all())
+        promise = f"LARP: this row is not finite; a healthy row beside it within 1 mm of without, {STEPS} steps"
+        seen = f"{'finite' if whole else 'not finite'}, beside it {1e3 * beside:.2g} mm"
+        found.append(row("state that is no state", name, promise, seen, not whole and beside <= 1e-3))
+    return found
+
+
+def offsets(bench: Bench) -> list[Row]:
+    """The kick, moved along the ground: the prediction moves with it, as far as the numbers are dense."""
+    found = []
+    for bits, places in ((32, (10.0, 100.0, 1e3, 1e4)), (64, (1e4, 1e6))):
+        with jax.enable_x64(bits == 64):
+            model = in_double(bench.model) if bits == 64 else bench.model
+            starts = np.tile(bench.kick.start(), (len(places) + 1, 1, 1))
+            for index, place in enumerate(places):
+                starts[index, :, 0] += place
+            controls = np.broadcast_to(bench.controls, (len(starts), *bench.controls.shape))
+            after = np.asarray(jax.jit(model.rollout)(starts, controls), float)
+        for index, place in enumerate(places):
+            shifted = after[index] - after[-1]
+            shifted[..., 0] -= place
+            moved = float(np.abs(shifted[..., packed.POSITION]).max())
+            promise = f"LARP: {STEPS} steps shift with the world, within 1 cm"
+            found.append(row("offset", f"{place:g} m, float{bits}", promise, f"{100 * moved:.2g} cm", moved <= 0.01))
+    truth = Truth(bench.kick.scene, 1, threads=1)
+    for place in (100.0, 1e4):
+        start = bench.kick.start()[None]
+        start[..., 0] += place
+        states, flags = truth.rollout(start, bench.controls[None])
+        found.append(flagged("offset", f"{place:g} m", states[0], bool(flags[0])))
+    return found
+
+
+# Precision, batches, horizons, geometry.
+
+
+def in_double(model: Simulator) -> Simulator:
+    """The model with weights of 64 bits."""
+    return replace(model, weights=jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), model.weights))
+
+
+def precision(bench: Bench) -> list[Row]:
+    """What comes in decides the precision; what is too coarse is refused."""
+    found = []
+    start, controls = bench.kick.start()[None], bench.controls[None]
+    single = np.asarray(jax.jit(bench.model.rollout)(start, controls))
+    with jax.enable_x64(True):
+        model = in_double(bench.model)
+        double = jax.jit(model.rollout)(start, controls)
+        kept = double.dtype == jnp.float64
+        found.append(row("precision", "float64", "LARP: 64 bits in, 64 bits out", str(double.dtype), kept))
+        mixed = bench.model.rollout(jnp.asarray(start, jnp.float32), jnp.asarray(controls[:, :2]))
+        said = "LARP: 32 bits in, 32 bits out, where JAX holds 64 too"
+        found.append(row("precision", "float32 beside float64", said, str(mixed.dtype), mixed.dtype == jnp.float32))
+        error = np.linalg.norm((np.asarray(double) - single)[..., packed.POSITION], axis=-1)[0]
+    for steps, limit in ((10, 1e-3), (STEPS, 1e-2)):
+        worst = float(error[:steps].max())
+        promise = f"LARP: within {1e3 * limit:g} mm of float64 for {steps} steps"
+        found.append(row("precision", f"float32, {steps} steps", promise, f"{1e3 * worst:.2g} mm", worst <= limit))
+    for kind in (jnp.bfloat16, jnp.float16, jnp.int32):
+        for name, call in (
+            ("step", partial(bench.model.step, control=jnp.asarray(controls[:, 0]))),
+            ("rollout", partial(bench.model.rollout, controls=jnp.asarray(controls))),
+        ):
+            seen, held = refusal(partial(call, jnp.asarray(start, kind)), "state has numbers of type")
+            found.append(row("precision", f"{kind.__name__}, {name}", "LARP: refused by name", seen, held))
+    return found
+
+
+def refusal(call: Callable[[], Any], words: str) -> tuple[str, bool]:
+    """What a call that must be refused says, and whether it is a ValueError with these words."""
+    try:
+        call()
+    except Exception as error:
+        return f"{type(error).__name__}: {str(error).splitlines()[0][:90]}", isinstance(error, ValueError) and (
+            words in str(error)
+        )
+    return "not refused", False
+
+
+def batches(bench: Bench) -> list[Row]:
+    """One step of 1 to 8192 states, each row as if it were alone."""
+    found = []
+    count = 8192
+    random = np.random.default_rng(1)
+    starts = np.tile(bench.kick.reference.states[0], (count, 1, 1)).astype(np.float32)
+    starts[:, 0, packed.VELOCITY] += random.standard_normal((count, 3))
+    controls = np.broadcast_to(bench.controls[0], (count, *bench.controls[0].shape)).astype(np.float32)
+    run = jax.jit(bench.model.step)
+    alone = np.concatenate([np.asarray(run(starts[i : i + 1], controls[i : i + 1])) for i in range(8)])
+    for size in (1, 2, 16, 256, 2048, count):
+        after = np.asarray(run(starts[:size], controls[:size]))
+        rows = min(size, len(alone))
+        worst = float(np.abs(after[:rows] - alone[:rows]).max())
+        promise = "LARP: finite, and every row as alone within 1e-3 (m, m/s, rad/s)"
+        seen = f"off by {worst:.1e}"
+        found.append(row("batch", size, promise, seen, bool(np.isfinite(after).all() and worst <= 1e-3)))
+    return found
+
+
+def horizons(bench: Bench) -> list[Row]:
+    """The kick and then the reference's last targets, for 20 000 steps (200 s)."""
+    kick, scene = bench.kick, bench.kick.scene
+    length = 20_000
+    controls = kick.reference.window(0, length)[1][None]
+    states = np.asarray(jax.jit(bench.model.rollout)(kick.start()[None], controls))[0]
+    true, flags = Truth(scene, 1, threads=1).rollout(kick.start()[None], controls)
+    shape = features.morphology(scene)[None]
+    apart = np.linalg.norm(np.asarray(features.displacement(scene, jnp.asarray(states), shape)), axis=-1)
+    found, begin = [], 0
+    for steps in (100, 1_000, 5_000, length):
+        part = states[begin:steps]
+        found.append(
+            row(
+                "horizon",
+                f"{steps} steps",
+                f"LARP: finite, quaternions of unit length, no link beyond {FASTEST:g} m/s",
+                f"fastest {fastest(part):.3g} m/s",
+                bool(np.isfinite(part).all() and fastest(part) <= FASTEST),
+            )
+        )
+        opened = float(apart[begin:steps].max())
+        promise = f"LARP: joints stay closed within {100 * CLOSED:g} cm"
+        found.append(row("horizon", f"{steps} steps", promise, f"{100 * opened:.2g} cm", opened <= CLOSED))
+        sunk = float(np.abs(states[steps - 1, -1, 2] - scene.links[-1].radius))
+        promise = "LARP: the ball lies on the ground within 1 cm at the end"
+        if steps >= 1_000:
+            found.append(row("horizon", f"{steps} steps", promise, f"{100 * sunk:.2g} cm", sunk <= 0.01))
+        found.append(flagged("horizon", f"{steps} steps", true[0, :steps], bool(flags[0])))
+        begin = steps
+    return found
+
+
+def geometry() -> list[Row]:
+    """Closest points, their reverse and forward gradients, and impacts, where capsules are degenerate."""
+    x, y, zero = np.array([0.3, 0.0, 0.0]), np.array([0.0, 0.3, 0.0]), np.zeros(3)
+    pairs = {
+        "centres coincide": (zero, x, zero, y, -0.15),
+        "the same capsule twice": (zero, x, zero, x, -0.15),
+        "parallel, side by side": (zero, x, y, x, 0.15),
+        "parallel, end to end": (zero, x, 3 * x, x, 0.15),
+        "antiparallel": (zero, x, y, -x, 0.15),
+        "nearly parallel": (zero, x, y, x + 1e-5 * y, 0.149994),
+        "both of length zero": (zero, zero, x, zero, 0.15),
+        "length zero, coincident": (zero, zero, zero, zero, -0.15),
+        "length zero on the axis": (zero, x, 0.5 * x, zero, -0.15),
+        "crossing": (zero, x, 0.1 * x, y, -0.15),
+        "1e6 m apart": (zero, x, 1e6 * y / 0.3, x, 1e6 - 0.15),
+    }
+    places = np.stack([np.stack(vectors) for *vectors, _ in pairs.values()])
+    expected = np.array([distance for *_, distance in pairs.values()])
+
+    def distance(numbers: jax.Array) -> jax.Array:
+        one, two = (
+            contact.Segment(numbers[n], numbers[n + 1], jnp.asarray(radius, numbers.dtype))
+            for n, radius in ((0, 0.1), (2, 0.05))
+        )
+        return contact.closest(one, two).distance
+
+    found = []
+    for bits in (32, 64):
+        with jax.enable_x64(bits == 64):
+            numbers = jnp.asarray(places)
+            value, reverse = jax.jit(jax.vmap(jax.value_and_grad(distance)))(numbers)
+            forward = jax.jit(jax.vmap(jax.jacfwd(distance)))(numbers)
+        off = np.abs(np.asarray(value) - expected) / np.maximum(1.0, np.abs(expected))
+        apart = np.abs(np.asarray(reverse) - np.asarray(forward)).max(axis=(1, 2))
+        promise = "distance right within 1e-5, gradients finite, reverse = forward within 1e-5"
+        for name, wrong, differ in zip(pairs, off, apart, strict=True):
+            seen = f"distance off by {wrong:.0e}, gradients by {differ:.0e}"
+            found.append(row("capsules", f"{name}, float{bits}", promise, seen, wrong <= 1e-5 and differ <= 1e-5))
+    return found
+
+
+# Random scenes.
+
+
+def drawn(kind: str, random: np.random.Generator | None) -> Scene:
+    """A scene of a kind, its sizes drawn from a tenth to ten times the usual; the usual ones without a generator."""
+
+    def size(usual: float) -> float:
+        return usual if random is None else float(usual * 10.0 ** random.uniform(-1.0, 1.0))
+
+    def person(name: str) -> Any:
+        if random is None:
+            return human(name)
+        segments = ("torso", "upper_arm", "thigh", "shin", "foot")
+        lengths, radii = ({each: float(random.uniform(0.3, 3.0)) for each in segments} for _ in range(2))
+        return human(name, float(random.uniform(0.3, 3.0)), size(70.0), lengths, radii)
+
+    def round_one(name: str) -> Any:
+        return ball(name, size(0.11), size(0.43))
+
+    bodies: dict[str, tuple[Any, ...]] = {
+        "ball": (round_one("ball"),),
+        "two balls": (round_one("first"), round_one("ball")),
+        "capsule": (capsule("capsule", size(0.4), size(0.08), size(1.0)),),
+        "capsule and ball": (capsule("capsule", size(0.4), size(0.08), size(1.0)), round_one("ball")),
+        "two capsules": tuple(capsule(name, size(0.4), size(0.08), size(1.0)) for name in ("first", "capsule")),
+        "chain": (chain("chain", 4, size(0.3), size(0.06), size(1.0)),),
+        "chain and ball": (chain("chain", 4, size(0.3), size(0.06), size(1.0)), round_one("ball")),
+        "human": (person("human"),),
+        "human and ball": (person("human"), round_one("ball")),
+        "two humans": (person("first"), person("human")),
+    }
+    chosen = bodies[kind]
+    if len(chosen) == 1:
+        return Scene(chosen)
+    first, second = chosen
+    one, two = (KICKING_LINKS if each.kind == "human" else tuple(link.name for link in each.links) for each in chosen)
+    return Scene(chosen, (Pair(first.name, second.name, one, two, ball().surface),))
+
+
+def wild(scene: Scene, count: int, random: np.random.Generator) -> np.ndarray:
+    """States (count, L, 13): any turn, speeds to 50 m/s, spins to 200 rad/s, below ground, some all in one place."""
+    states = np.zeros((count, len(scene.links), packed.SIZE))
+    spread = 10.0 ** random.uniform(-3.0, 0.5, (count, 1, 1))
+    states[..., packed.POSITION] = spread * random.standard_normal((count, len(scene.links), 3)) + (0.0, 0.0, 0.5)
+    together = random.random(count) < 0.2
+    states[together, :, packed.POSITION] = states[together, :1, packed.POSITION]
+    turned = random.standard_normal((count, len(scene.links), 4))
+    states[..., packed.ORIENTATION] = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
+    for columns, most in ((packed.VELOCITY, 50.0), (packed.ANGULAR_VELOCITY, 200.0)):
+        size = most * 10.0 ** random.uniform(-4.0, 0.0, (count, 1, 1))
+        states[..., columns] = size * random.uniform(-1.0, 1.0, (count, len(scene.links), 3)) / np.sqrt(3.0)
+    return states
+
+
+def untrained(scene: Scene, seed: int) -> Simulator:
+    """A simulator of the scene with random networks, its inputs measured on wild states."""
+    states = wild(scene, 64, np.random.default_rng(seed)).astype(np.float32)
+    control, torque = jnp.zeros((64, len(scene.motors), 3)), jnp.zeros((64, len(scene.links), 3))
+    measured = measure(scene, TINY, jnp.asarray(states), jnp.asarray(states[::-1].copy()), control, torque)
+    return Simulator(scene, TINY, initial_weights(scene, TINY, jax.random.key(seed), measured))
+
+
+class Tally(NamedTuple):
+    """Random scenes of a kind: how many states were tried, and what went wrong."""
+
+    tried: int
+    crashes: list[str]
+    larp_lost: int  # not finite, and costs infinity
+    truth_lost: int  # flagged as diverged
+    silent: int  # not finite, and nothing says so
+    slowest: float  # s, of a scene in the engine
+
+
+def random_scenes(kind: str, model: Simulator, scenes: int, each: int, steps: int, seed: int) -> Tally:
+    """Random sizes and states of one kind of scene, in MuJoCo and in the learned simulator."""
+    random = np.random.default_rng((seed, KINDS.index(kind)))
+    crashes: list[str] = []
+    truth_lost = silent = 0
+    slowest = 0.0
+    starts, targets, pushes, shapes = [], [], [], []
+    for _ in range(scenes):
+        scene = drawn(kind, random)
+        state = wild(scene, each, random)
+        bound = np.array([(motor.lower, motor.upper) for motor in scene.motors]).reshape(-1, 2, 3)
+        share = random.uniform(0.0, 1.0, (each, steps, len(scene.motors), 3))
+        control = 2.0 * (bound[:, 0] + share * (bound[:, 1] - bound[:, 0]))
+        torque = 100.0 * random.standard_normal((each, 1, len(scene.links), 3)) * (random.random((each, 1, 1, 1)) < 0.2)
+        torque = np.repeat(torque, steps, axis=1)
+        begin = time.monotonic()
+        try:
+            states, flags = Truth(scene, each).rollout(state, control, torque)
+            truth_lost += int((~flags).sum())
+            silent += int((flags & ~np.isfinite(states).all(axis=(1, 2, 3))).sum())
+        except Exception as error:
+            crashes.append(f"MuJoCo: {type(error).__name__}: {error}")
+        slowest = max(slowest, time.monotonic() - begin)
+        starts.append(state)
+        targets.append(control)
+        pushes.append(torque)
+        shapes.append(np.repeat(np.asarray(features.morphology(scene))[None], each, axis=0))
+    larp_lost = 0
+    size = CostTerm("size", lambda states, controls, context: states[:, :, 2])
+    try:
+        arguments = [np.concatenate(parts).astype(np.float32) for parts in (starts, targets, pushes, shapes)]
+        run = jax.jit(lambda s, u, t, shape: model.rollout(s, u, torques=t, shape=shape))
+        after = run(*arguments)
+        costs = jax.vmap(lambda s, u: evaluate([size], s, u)[0])(after, arguments[1])
+        lost = ~np.isfinite(after).all(axis=(1, 2, 3))
+        larp_lost = int(lost.sum())
+        silent += int((lost & np.isfinite(costs)).sum())
+    except Exception as error:
+        crashes.append(f"LARP: {type(error).__name__}: {error}")
+    return Tally(scenes * each, crashes, larp_lost, truth_lost, silent, slowest)
+
+
+def scene_rows(kind: str, model: Simulator, scenes: int, each: int, seed: int) -> list[Row]:
+    """The promises of random scenes of a kind."""
+    found = random_scenes(kind, model, scenes, each, 10, seed)
+    value = f"{kind}, {found.tried} states"
+    crashed = f"{len(found.crashes)} crashes" + (f", the first: {found.crashes[0][:80]}" if found.crashes else "")
+    said = f"{found.silent} silent; flagged: LARP {found.larp_lost}, MuJoCo {found.truth_lost}"
+    return [
+        row("random scenes", value, "0 crashes, no scene beyond 60 s", f"{crashed}, slowest {found.slowest:.1f} s",
+            not found.crashes and found.slowest < 60.0),
+        row("random scenes", value, "0 numbers that are not finite without saying so", said, found.silent == 0),
+        row("random scenes", value, "LARP: all finite", f"{found.larp_lost} not", found.larp_lost == 0),
+    ]  # fmt: skip

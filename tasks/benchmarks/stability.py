@@ -1,0 +1,302 @@
+"""Where it breaks: sizes, states, precision, horizons, gradients, planners and random scenes, pushed until they do.
+
+One row a case: what was pushed, what is promised, what was seen, and whether the promise held.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from larp_model import weights as stored
+from larp_model.truth.mujoco import Truth
+from mpc import CEM, CostTerm, Gradient, Planner
+from mpc.loop import Phase, Window, execute
+from tasks.benchmarks import pushes, report, slopes
+from tasks.benchmarks.pushes import Bench, refusal, row
+from tasks.benchmarks.report import Row
+from tasks.kick import REACHABLE, WEIGHTS, checked_target, miss, models_of, prepare, remember_compilations, run
+
+COLOURS = {True: "#0072b2", False: "#d55e00"}
+SMALL = CEM(samples=8, rounds=2, elites=2)
+
+
+# Planners.
+
+
+@dataclass(frozen=True)
+class Shaky:
+    """One link that moves by 100 u dt, and is lost where its target's first number is beyond `lost` [rad]."""
+
+    lost: float
+    steepness: float = 1.0
+
+    differentiable = True
+
+    def rollout(self, state: jax.Array, controls: jax.Array, steps: jax.Array | None = None) -> jax.Array:
+        """See `mpc.Dynamics.rollout`."""
+        moved = self.steepness * jnp.cumsum(controls[:, :, 0], axis=1)
+        states = jnp.repeat(state[:, None], controls.shape[1], axis=1).at[..., 0, :3].add(moved)
+        gone = jnp.any(jnp.abs(controls[:, :, 0, 0]) > self.lost, axis=1)
+        return jnp.where(gone[:, None, None, None], jnp.nan, states)
+
+
+def toy(dynamics: Any, optimizers: Any = SMALL, horizon: int = 6, knots: int = 2, spread: float = 0.1) -> Planner:
+    """A planner that wants one link at (0.3, 0, 0) m."""
+    reach = CostTerm("reach", lambda states, controls, context: states[-1, 0, :3] - jnp.array([0.3, 0.0, 0.0]))
+    return Planner(dynamics, [reach], horizon, knots, 0.01, np.full((1, 3), spread), optimizers)
+
+
+def planned(planner: Planner, state: Any = None, reference: Any = None) -> tuple[Any, Any]:
+    """The plan and what was found out, from rest and from zero targets by default."""
+    state = np.zeros((1, 13)) if state is None else state
+    reference = np.zeros((planner.horizon, 1, 3)) if reference is None else reference
+    return planner.step(planner.init(jax.random.key(0)), state, reference)
+
+
+def small_planners() -> list[Row]:
+    """Planners of one link, where there is hardly anything to choose from or nothing comes back."""
+    found = []
+
+    def says(value: str, promise: str, planner: Planner, expected: Callable[[Any, Any], bool], **given: Any) -> None:
+        plan, info = planned(planner, **given)
+        seen = f"cost {info.cost:.3g}, {info.finite} of {info.candidates} finite"
+        whole = bool(np.isfinite(plan.knots).all() and np.isfinite(plan.spread).all())
+        held = whole and expected(plan, info)
+        found.append(row("planner", value, promise, seen if whole else "the plan is not finite", held))
+
+    nothing = "the plan carried on, cost inf, 0 candidates finite"
+    lost = lambda plan, info: info.cost == np.inf and info.finite == 0 and not np.asarray(plan.knots).any()  # noqa: E731
+    good = lambda plan, info: info.cost < 0.5 * 0.3**2 and info.finite > 0  # noqa: E731
+    better = "a finite plan that costs less than none"
+    for name, optimizers in (("CEM", SMALL), ("Gradient", Gradient(elites=2)), ("both", (SMALL, Gradient(elites=2)))):
+        says(f"all candidates lost, {name}", nothing, toy(Shaky(-1.0), optimizers), lost)
+        says(f"most candidates lost, {name}", better, toy(Shaky(0.05), optimizers), good)
+    says("one candidate", better, toy(Shaky(np.inf), Gradient(steps=8, elites=1)), good)
+    says("the fewest of CEM: 4", better, toy(Shaky(np.inf), CEM(samples=4, rounds=4, elites=2)), good)
+    says("horizon 2, the shortest", better, toy(Shaky(np.inf), horizon=2), good)
+    says("horizon 2000", better, toy(Shaky(np.inf), horizon=2000), good)
+    for steepness in (1e8, 1e15, 1e25):
+        steep = toy(Shaky(np.inf, steepness), Gradient(steps=2, elites=1))
+        promise = "finite knots; cost finite, or inf and 0 finite"
+        consistent = lambda plan, info: np.isfinite(info.cost) == (info.finite > 0)  # noqa: E731
+        says(f"a slope of {steepness:g} m/rad", promise, steep, consistent)
+    wild = np.full((6, 1, 3), np.nan)
+    says("reference of NaN", nothing, toy(Shaky(np.inf)), lost, reference=wild)
+    says(
+        "reference at infinity",
+        better,
+        toy(Shaky(np.inf)),
+        lambda p, i: i.finite > 0,
+        reference=np.full((6, 1, 3), np.inf),
+    )
+    locked = lambda plan, info: not np.asarray(plan.knots).any() and info.finite > 0  # noqa: E731
+    says("spread 0", "the reference itself", toy(Shaky(np.inf), spread=0.0), locked)
+
+    coarse = toy(Shaky(np.inf))
+    target = jnp.full((6, 1, 3), 0.1234567, jnp.bfloat16)
+    kept = coarse.controls(coarse.init(jax.random.key(0)), target).dtype
+    found.append(row("planner", "reference of bfloat16", "joint targets of 32 bits", str(kept), kept == jnp.float32))
+    for value, words, call in (
+        ("horizon 1", "knots", lambda: toy(Shaky(0.0), horizon=1)),
+        ("one knot", "knots", lambda: toy(Shaky(0.0), knots=1)),
+        ("one candidate of CEM", "elites", lambda: CEM(samples=1, elites=1)),
+        ("no candidate of Gradient", "elites", lambda: Gradient(elites=0)),
+        ("spread not finite", "spread", lambda: toy(Shaky(0.0), spread=np.nan)),
+        ("state of NaN", "state", lambda: planned(coarse, state=np.full((1, 13), np.nan))),
+        ("state of 1e39", "state", lambda: planned(coarse, state=np.full((1, 13), 1e39))),
+        ("reference of another horizon", "reference", lambda: planned(coarse, reference=np.zeros((5, 1, 3)))),
+        ("target at infinity", "target", lambda: checked_target((np.inf, 0.0, 0.0))),
+        ("target of NaN", "target", lambda: checked_target((0.0, np.nan, 0.0))),
+    ):
+        with np.errstate(over="ignore"):
+            found.append(row("planner", value, "refused by name", *refusal(call, words)))
+    return found
+
+
+def targets(bench: Bench, whole: Any) -> list[Row]:
+    """Kick plans to targets where no ball can pass, and to some where it can."""
+    kick = bench.kick
+    planner = kick.planner(whole, (CEM(samples=16, rounds=2, elites=4),))
+    plan = planner.init(jax.random.key(0))
+    found = []
+    ball = kick.start()[-1, :3]
+    for name, target, reachable in (
+        ("ahead", (4.0, 0.0, 0.5), None),
+        ("behind the human", (-4.0, 0.0, 0.5), False),
+        ("inside the human", tuple(kick.start()[0, :3]), False),
+        ("the ball's own place", tuple(ball), True),
+        ("below the ground", (4.0, 0.0, -2.0), False),
+        ("1 km away", (1e3, 0.0, 0.0), False),
+        ("1e6 m away", (1e6, 0.0, 0.0), False),
+        ("1e19 m away", (1e19, 0.0, 0.0), False),
+        ("1e30 m away", (1e30, 0.0, 0.0), False),
+        ("at infinity", (np.inf, 0.0, 0.0), False),
+    ):
+        window = kick.window(np.array(target))(0)
+        after, info = planner.step(plan, kick.start(), window.controls, window.context, steps=window.steps)
+        with np.errstate(all="ignore"):
+            missed = miss(info.states[:, -1, :3], np.array(target)) if np.isfinite(target).all() else np.inf
+        whole_plan = bool(np.isfinite(after.knots).all())
+        honest = np.isfinite(info.cost) == (info.finite > 0)
+        right = reachable is None or (missed <= REACHABLE) == reachable
+        promise = "a finite plan, cost inf if no candidate is finite"
+        promise += "" if reachable is None else f", {'' if reachable else 'not '}within {REACHABLE:g} m of it"
+        seen = f"misses by {missed:.3g} m, cost {info.cost:.3g}, {info.finite} of {info.candidates} finite"
+        found.append(row("target", name, promise, seen, whole_plan and honest and right))
+    return found
+
+
+def execution(bench: Bench) -> list[Row]:
+    """Plans that are carried out in a world that does not stay finite."""
+    kick = bench.kick
+    found = []
+    still = toy(Shaky(np.inf))
+
+    class Lost:
+        """A world of one link that is lost in its third step."""
+
+        count = 0
+
+        def reset(self, states: np.ndarray) -> None:
+            """See `mpc.loop.World`."""
+
+        def step(self, control: np.ndarray) -> np.ndarray:
+            """See `mpc.loop.World`."""
+            self.count += 1
+            return np.full((1, 1, 13), np.nan if self.count == 3 else 0.0)
+
+    def carried_out(every: int, reference: float) -> None:
+        window = Window(np.full((6, 1, 3), reference), None)
+        phase = Phase(still, still, every, lambda step: window)
+        execute(Lost(), np.zeros((1, 13)), (phase,), 5, jax.random.key(0), 0.01)
+
+    for value, every in (("lost between two plans", 10), ("lost just before a plan", 3)):
+        seen, held = refusal(partial(carried_out, every, 0.0), "diverged in step 2")
+        found.append(row("execution", value, "ends at once and names the step", seen, held))
+    truth = Truth(kick.scene, 1, threads=1)
+    for name, change in (("torque of 1e9 N m", 1e9), ("torque of NaN", np.nan)):
+        truth.reset(kick.start()[None])
+        push = np.full((1, len(kick.scene.links), 3), change)
+        states = [truth.step(bench.controls[None, 0], push) for _ in range(3)]
+        lost = bool(np.isnan(states[-1]).all())
+        found.append(row("execution", name, "MuJoCo: the row is NaN from there on", "NaN" if lost else "numbers", lost))
+    return found
+
+
+def seen_by(jobs: dict[str, Callable[[], list[Row]]]) -> dict[str, Callable[[], Row]]:
+    """Jobs that give several rows each, as `report.collect` keeps them."""
+
+    def together(job: Callable[[], list[Row]]) -> Row:
+        return {"rows": job()}
+
+    return {name: partial(together, job) for name, job in jobs.items()}
+
+
+# The report.
+
+
+def picture(rows: list[Row], title: str) -> Figure:
+    """Every case a square, by what was pushed: blue where its promise held, orange where not."""
+    axes_names = list(dict.fromkeys(row["axis"] for row in rows))
+    half = (len(axes_names) + 1) // 2
+    figure = Figure(figsize=(13, 1.4 + 0.3 * half), layout="constrained")
+    figure.suptitle(title)
+    most = max(sum(row["axis"] == name for row in rows) for name in axes_names)
+    for axes, names in zip(figure.subplots(1, 2), (axes_names[:half], axes_names[half:]), strict=True):
+        for place, name in enumerate(names):
+            held = [row["held"] for row in rows if row["axis"] == name]
+            # Those that held first, so that a glance tells their share.
+            held.sort(reverse=True)
+            axes.scatter(range(len(held)), [place] * len(held), c=[COLOURS[h] for h in held], marker="s", s=26)
+        axes.set_yticks(range(len(names)), names)
+        axes.set(xlim=(-1, most), ylim=(half - 0.4, -0.6), xlabel="cases: blue held, orange not")
+        axes.spines[["top", "right", "left"]].set_visible(False)
+        axes.tick_params(left=False)
+    return figure
+
+
+def main(
+    scenes: int = 250,
+    seed: int = 0,
+    states: int = 1000,
+    json: Path = Path("runs/benchmarks/stability.json"),
+    weights: Path = stored.SHIPPED / f"{WEIGHTS}.json",
+    publish: bool = False,
+) -> None:
+    """Push the learned simulator, the planner and the engine until they break, and say where that is.
+
+    Args:
+        scenes: random scenes, each in 20 random states.
+        seed: of scenes, states and directions.
+        states: on which gradients are compared.
+        json: where the rows go; the picture goes beside them.
+        weights: manifest of the weights of the learned model.
+        publish: put the table into RESULTS.md.
+    """
+    kinds = len(pushes.KINDS)
+    if scenes < kinds:
+        raise ValueError(f"scenes is {scenes}, but must be at least {kinds}, one of each kind")
+    if states < 32:
+        raise ValueError(f"states is {states}, but must be at least 32")
+    report.ready(json, publish)
+    remember_compilations()
+    kick = prepare()
+    whole = models_of(kick.scene, "larp", weights).whole
+    bench = Bench(kick, whole.dynamics)  # type: ignore[attr-defined]
+
+    def scene_rows(kind: str) -> list[Row]:
+        model = bench.model if kind == "human and ball" else pushes.untrained(pushes.drawn(kind, None), seed)
+        share = len(range(pushes.KINDS.index(kind), scenes, kinds))
+        return pushes.scene_rows(kind, model, share, 20, seed)
+
+    jobs: dict[str, Callable[[], list[Row]]] = {
+        f"{body} {field}": partial(pushes.sizes, bench, body, field)
+        for body, field in (
+            ("human", "length"), ("human", "radius"), ("human", "mass"), ("ball", "radius"), ("ball", "mass")
+        )
+    }  # fmt: skip
+    jobs |= {
+        "wild states": partial(pushes.wild_states, bench),
+        "far and lost": partial(pushes.far_and_lost, bench),
+        "offsets": partial(pushes.offsets, bench),
+        "precision": partial(pushes.precision, bench),
+        "batches": partial(pushes.batches, bench),
+        "horizons": partial(pushes.horizons, bench),
+        "capsules": pushes.geometry,
+        "planners": small_planners,
+        "targets": partial(targets, bench, whole),
+        "execution": partial(execution, bench),
+        "gradients of steps": partial(slopes.of_steps, bench, states, seed),
+        "slopes of a ball": partial(slopes.ball_slopes, bench),
+        "gradients of kicks": partial(slopes.of_kicks, bench, whole, 64, seed),
+    }
+    jobs |= {f"random scenes: {kind}": partial(scene_rows, kind) for kind in pushes.KINDS}
+    command = f"python -m tasks.benchmarks.stability --scenes {scenes} --seed {seed} --states {states}"
+    rows = [each for found in report.collect(json, command, seen_by(jobs)) for each in found["rows"]]
+    held = sum(each["held"] for each in rows)
+    content = {"command": command, "hardware": report.hardware(), "cases": len(rows), "held": held, "rows": rows}
+    report.write_json(json, content)
+    title = f"Stability: {held} of {len(rows)} promises held"
+    report.write_picture(json.with_suffix(".png"), picture(rows, title))
+    table = Table("pushed", "to", "promised", "seen", "held", title=title)
+    for each in rows:
+        table.add_row(
+            each["axis"], each["value"], each["promise"], each["seen"], "yes" if each["held"] else "**not held**"
+        )
+    report.show(table)
+    if publish:
+        report.publish("stability", title, command, table)
+
+
+if __name__ == "__main__":
+    run(main)
