@@ -126,7 +126,7 @@ def test_a_reference_of_bfloat16_becomes_targets_of_32_bits() -> None:
     assert controls.dtype == jnp.float32
 
 
-@pytest.mark.parametrize("kind", ["capsule and ball", "chain"])
+@pytest.mark.parametrize("kind", ["ball", "chain"])
 def test_random_scenes_neither_crash_nor_hide_what_is_not_finite(kind: str) -> None:
     model = pushes.untrained(pushes.drawn(kind, None), seed=0)
     found = pushes.random_scenes(kind, model, scenes=3, each=4, steps=3, seed=0)
@@ -149,7 +149,7 @@ def test_closest_points_keep_their_promises_where_capsules_are_degenerate() -> N
 def test_every_case_has_a_place_in_the_picture() -> None:
     rows = [pushes.row(axis, 1, "promise", "seen", held) for axis in ("a", "b", "c") for held in (True, False)]
     drawn = stability.picture(rows, "title")
-    assert sum(len(each.get_offsets()) for axes in drawn.axes for each in axes.collections) == len(rows)
+    assert sum(np.shape(each.get_offsets())[0] for axes in drawn.axes for each in axes.collections) == len(rows)
 
 
 def test_too_few_scenes_are_refused(tmp_path: Path) -> None:
