@@ -112,7 +112,10 @@ def moved(segment: Segment, velocity: Array, angular_velocity: Array, time: Arra
 
 
 def time_of_impact(distance: Array, approach: Array, limit: Array | float) -> Array:
-    """(*,) [s] until a gap `distance` closes at speed `approach`, within [0, limit]; `limit` if it does not."""
+    """(*,) [s] until a gap `distance` closes at speed `approach`, within [0, limit]; `limit` if it does not.
+
+    It jumps where bodies that part touch at just no distance: there alone no gradient is that of the differences.
+    """
     closing = approach > 1e-3
     time = jnp.maximum(distance, 0.0) / jnp.where(closing, approach, 1.0)
     return jnp.where(closing | (distance <= 0.0), jnp.minimum(time, limit), limit)

@@ -21,7 +21,7 @@ from tasks.kick import KNOTS, SEARCH, Kick
 
 # Central differences over the largest of these [m, rad, m/s, rad/s, along a random direction of unit normal numbers];
 # a state whose kink lies within it is tried again with the next.
-DIFFERENCES = (1e-7, 1e-8, 1e-9)
+DIFFERENCES = (1e-7, 1e-8, 1e-9, 1e-10)
 AGREE = 0.01
 # Cost per spread; a kick costs some tens, so that a true slope beyond this says nothing of a spread away.
 USEFUL = 1e3
@@ -47,7 +47,7 @@ def step_gradients(bench: Bench, states: np.ndarray, controls: np.ndarray, seed:
     """Relative errors (N,) of one step's gradients in float64, along a random direction of state and targets each.
 
     reverse: of the pairing with a random vector, against forward. differences: of the vector, |central - forward| /
-    |forward|, by the width of the difference, one row each (3, N).
+    |forward|, by the width of the difference, one row each (4, N).
     """
     random = np.random.default_rng(seed)
     along = random.standard_normal(states.shape), random.standard_normal(controls.shape)
@@ -93,7 +93,7 @@ def of_steps(bench: Bench, count: int, seed: int) -> list[Row]:
         best = errors.min(axis=0)
         seen = (
             f"median {np.median(errors[0]):.0e}, worst {best.max():.1e}; {kinked} of {errors.shape[1]} "
-            f"needed less than {DIFFERENCES[0]:.0e}: a kink is nearer"
+            f"needed less than {DIFFERENCES[0]:.0e}: a kink is nearer; {int((best > AGREE).sum())} jump"
         )
         promise = f"forward = central differences within {100 * AGREE:g} %, |apart| / |forward|"
         rows.append(row("gradient of a step", f"{name}, float64", promise, seen, bool(best.max() <= AGREE)))
