@@ -407,7 +407,8 @@ class Simulator:
         }
         for name, (value, size) in needed.items():
             if value is not None and np.shape(value) != size:
-                raise ValueError(f"{name} have shape {np.shape(value)}, but need {size}")
+                wanted = f"({len(state)}, {'H, ' if steps else ''}{size[-2]}, 3)"
+                raise ValueError(f"{name} have shape {np.shape(value)}, but need {wanted}")
         if shape is not None and np.shape(shape) not in ((1, links, 3), (len(state), links, 3)):
             raise ValueError(f"shape has shape {np.shape(shape)}, but needs ({len(state)} or 1, {links}, 3)")
         torque, shape = (None if value is None else jnp.asarray(value, state.dtype) for value in (torque, shape))
