@@ -95,10 +95,12 @@ def launch(simulator: Simulator, episodes: Trajectories, before: int) -> dict[st
     size = np.linalg.norm(true, axis=-1)
     error = np.linalg.norm(predicted - true, axis=-1) / size
     cosine = np.sum(predicted * true, axis=-1) / np.maximum(size * np.linalg.norm(predicted, axis=-1), 1e-9)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    diverged = ~np.isfinite(error)
     return {
         "count": len(rows),
-        "relative_error": quantiles(error),
-        "angle_deg": quantiles(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))),
+        "relative_error": quantiles(np.where(diverged, np.inf, error)),
+        "angle_deg": quantiles(np.where(diverged, 180.0, angle)),
     }
 
 

@@ -385,12 +385,16 @@ class Simulator:
     ) -> Array:  # fmt: skip
         """States (N, H, L, 13) after each of H steps from states (N, L, 13) under controls (N, H, J, 3) [rad].
 
+        From where a trajectory diverges it holds NaN: see `state.healthy`.
+
         steps (): so many of the H are computed, the rest repeat the last; all by default. torques: external, (N, H, L,
         3) [N m]. shape: morphology (N or 1, L, 3); the scene's by default. All are taken in the state's precision, 32
         or 64 bits. Positions in 32 bits are 0.1 mm apart 1 km from the origin: plan near it.
         """
         given = self._checked(state, controls, torques, shape, np.shape(controls)[1:2])
-        return rollout(self.scene, self.config, self.weights, *given, steps=steps)
+        states = rollout(self.scene, self.config, self.weights, *given, steps=steps)
+        lost = jnp.cumsum(~packed.healthy(states), axis=1) > 0
+        return jnp.where(lost[..., None, None], jnp.nan, states)
 
     def _checked(
         self, state: Array, control: Array, torque: Array | None, shape: Array | None, steps: tuple[int, ...]

@@ -6,6 +6,8 @@ Columns: position of the centre of mass [m], orientation quaternion (w, x, y, z)
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 from jax import Array
 
@@ -14,6 +16,8 @@ POSITION = slice(0, 3)
 ORIENTATION = slice(3, 7)
 VELOCITY = slice(7, 10)
 ANGULAR_VELOCITY = slice(10, 13)
+# Beyond these a trajectory has diverged, in every engine [m/s, rad/s].
+LIMITS = ((VELOCITY, 1e2), (ANGULAR_VELOCITY, 1e3))
 
 
 def position(state: Array) -> Array:
@@ -39,3 +43,12 @@ def angular_velocity(state: Array) -> Array:
 def pack(position: Array, orientation: Array, velocity: Array, angular_velocity: Array) -> Array:
     """The state (*, L, 13) of its four parts."""
     return jnp.concatenate([position, orientation, velocity, angular_velocity], axis=-1)
+
+
+def healthy(state: Any) -> Any:
+    """(*,) whether all links of states (*, L, 13), of NumPy or JAX, are finite and within `LIMITS`."""
+    xp = state.__array_namespace__()
+    found = xp.all(xp.isfinite(state), axis=(-2, -1))
+    for columns, limit in LIMITS:
+        found = found & xp.all(xp.abs(state[..., columns]) < limit, axis=(-2, -1))
+    return found

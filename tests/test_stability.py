@@ -52,6 +52,15 @@ def test_numbers_that_are_too_coarse_are_refused_by_name(ball_model: Simulator, 
         ball_model.rollout(state, jnp.zeros((1, 4, 0, 3)))
 
 
+def test_a_prediction_is_flagged_from_where_it_diverges_and_no_other_row_with_it(ball_model: Simulator) -> None:
+    states = np.repeat(lying_ball(), 3, axis=0)
+    states[1, 0, 2], states[1, 0, 9] = 50.0, -99.95  # falls past 100 m/s in its first step
+    states[2, 0, packed.POSITION] = 1e6, 0.0, 1e6
+    after = np.asarray(ball_model.rollout(jnp.asarray(states), jnp.zeros((3, 4, 0, 3))))
+    assert np.isfinite(after[[0, 2]]).all()
+    assert np.isnan(after[1]).all()
+
+
 @pytest.mark.parametrize(
     ("name", "value"), [("torques", jnp.zeros((1, 3, 1, 3))), ("shape", jnp.zeros((2, 1, 3))), ("shape", jnp.zeros(3))]
 )
@@ -134,8 +143,14 @@ def test_random_scenes_neither_crash_nor_hide_what_is_not_finite(kind: str) -> N
 
 
 def test_what_is_hidden_would_be_found() -> None:
-    lost = np.full((4, 1, 13), np.nan)
-    assert not pushes.bounded("axis", "value", lost)["held"]
+    lost, resting = np.full((4, 1, packed.SIZE), np.nan), np.zeros((4, 1, packed.SIZE))
+    resting[..., 3] = 1.0
+    assert pushes.bounded("axis", "value", resting)["held"]
+    assert "flagged after 2 steps" in pushes.bounded("axis", "value", np.concatenate([resting[:2], lost]))["seen"]
+    for column, value in ((0, np.nan), (3, 1.1), (7, 200.0)):
+        odd = resting.copy()
+        odd[2, 0, column] = value
+        assert not pushes.bounded("axis", "value", odd)["held"]
     assert not pushes.flagged("axis", "value", lost, True)["held"]
     assert pushes.flagged("axis", "value", lost, False)["held"]
     assert pushes.refusal(partial(int, "3"), "")[1] is False

@@ -178,7 +178,7 @@ def of_kicks(bench: Bench, whole: Dynamics, count: int, seed: int) -> list[Row]:
         for steps in lengths:
             costs, gradient = slope(knots, steps)
             entries = int((~np.isfinite(gradient).all(axis=(1, 2, 3)) & np.isfinite(costs)).sum())
-            norms = np.linalg.norm(gradient.reshape(count, -1).astype(float), axis=1)
+            norms = np.linalg.norm(gradient.reshape(count, -1).astype(float), axis=1)[np.isfinite(costs)]
             norms = np.nan_to_num(norms, nan=np.inf)
             value = f"{steps} steps of the {name}"
             seen = f"{entries} of {count} not finite"
