@@ -23,8 +23,9 @@ $(READY): pyproject.toml constraints.txt
 	@$(RUN) pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[test]'
 	@touch $@
 
+# Two at a time: most of it is compilation, which keeps one core busy.
 test: $(READY)
-	@$(RUN) pytest tests
+	@$(RUN) pytest -n 2 --dist loadfile tests
 
 lint: $(READY)
 	$(RUN) ruff check

@@ -45,7 +45,7 @@ ALONE = ("bullet",)
 # Gradients are asked for up to this batch, accuracy beside the time at it, and memory is shown at it.
 MIDDLE = 512
 # A row's process is ended after so many seconds. Where a step takes so many, larger batches are not asked for.
-SECONDS, SLOW = 300.0, 2.5
+SECONDS, SLOW = 300.0, 0.5
 PRESET = "fast"
 STYLES = {"spring": "--", "positional": ":"}
 COLOURS = {"larp": "#d55e00", "mujoco": "#0072b2", "mjx": "#009e73", "brax": "#cc79a7", "bullet": "#7f7f7f"}

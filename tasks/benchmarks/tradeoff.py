@@ -71,39 +71,45 @@ def cem(samples: int, rounds: int, elites: int) -> CEM:
     return CEM(samples=samples, rounds=rounds, elites=elites, decay=1.0)
 
 
-def points() -> Iterator[Point]:
-    """What is measured: the presets, and what lies around them."""
-    yield from map(Point, PRESETS.values())
+def points() -> tuple[Point, ...]:
+    """What is measured: the presets, and what lies around them, each once."""
+    return tuple(dict.fromkeys((*map(Point, PRESETS.values()), *_around())))
+
+
+def _around() -> Iterator[Point]:
+    # More candidates, more rounds.
     for samples, rounds, elites in (
-        (32, 4, 8), (32, 16, 8), (64, 2, 12), (64, 4, 12), (64, 8, 12), (64, 16, 12), (128, 2, 16), (128, 8, 16),
-        (256, 4, 24), (512, 4, 32),
+        (32, 4, 8), (32, 16, 8), (64, 2, 12), (64, 4, 12), (64, 8, 12), (64, 16, 12), (64, 32, 12), (128, 2, 16),
+        (128, 4, 16), (128, 8, 16), (128, 16, 16), (256, 4, 24), (512, 4, 32),
     ):  # fmt: skip
         again = cem(max(2 * elites, samples // 2), max(1, rounds // 3), elites)
         yield Point(Preset((cem(samples, rounds, elites),), (again,), every=5))
     quick, few = cem(128, 4, 16), cem(64, 1, 16)
     wide, some = cem(256, 10, 24), cem(128, 3, 24)
-    deep, deeper = cem(64, 8, 12), cem(64, 16, 12)
+    deep, deeper, rest = cem(64, 8, 12), cem(64, 16, 12), cem(32, 2, 12)
+    # More replans.
     for every in (1, 2, 3, 8, 12):
         yield Point(Preset((quick,), (few,), every))
     yield Point(Preset((quick,), (cem(128, 2, 16),), every=5))
-    yield Point(Preset((wide,), (some,), every=8))
-    yield Point(Preset((wide,), (cem(128, 1, 24),), every=4))
+    for every, again in ((4, some), (8, some), (4, cem(128, 1, 24))):
+        yield Point(Preset((wide,), (again,), every))
+    # Gradients.
     for elites, steps in ((8, 4), (8, 8), (16, 8)):
         yield Point(Preset((quick, Gradient(steps=steps, elites=elites)), (few,), every=5))
     yield Point(Preset((quick,), (few, Gradient(steps=2, elites=8)), every=5))
     yield Point(Preset((Gradient(steps=16, elites=32),), (Gradient(steps=4, elites=32),), every=5))
     yield Point(Preset((wide, Gradient(steps=8, elites=16)), (some,), every=4))
+    # Trials in the truth.
     for verify in ((1, 1), (2, 1), (4, 2)):
         yield Point(Preset((quick,), (few,), every=5, verify=verify))
     yield Point(Preset((wide,), (some,), every=4, verify=(2, 2)))
     for first, every, verify in ((deep, 5, (2, 2)), (deep, 5, (4, 2)), (deeper, 2, (4, 2))):
-        yield Point(Preset((first,), (cem(32, 2, 12),), every, verify))
+        yield Point(Preset((first,), (rest,), every, verify))
+    most = cem(512, 12, 32), Gradient(steps=16, elites=32)
+    yield Point(Preset(most, (cem(256, 4, 32),), every=2, verify=(4, 2)))
+    # MuJoCo as the model.
     for substeps in (5, 10, 20):
-        for first, again in (
-            (cem(64, 2, 12), cem(32, 1, 12)),
-            (cem(128, 2, 16), few),
-            (quick, few),
-        ):
+        for first, again in ((cem(64, 2, 12), cem(32, 1, 12)), (cem(128, 2, 16), few), (quick, few)):
             yield Point(Preset((first,), (again,), every=5), "mujoco", substeps)
 
 
