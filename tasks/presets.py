@@ -11,6 +11,8 @@ from mpc import CEM, Gradient
 
 # Time of a replan, as a share of the first plan's, where a budget is given.
 AGAIN = 0.2
+# Candidates of the smallest round.
+LEAST = 8
 CORRECT = CEM(samples=128, rounds=2, elites=16, decay=1.0)
 STAND = CEM(samples=64, rounds=2, elites=12, decay=1.0)
 
@@ -33,17 +35,18 @@ class Preset:
     stand: Stage = (STAND,)
 
 
-# One population size throughout, because every size is compiled apart.
+# Points of `tasks.benchmarks.tradeoff`: many rounds of few candidates do better than few rounds of many. One population
+# size throughout, because every size is compiled apart.
 PRESETS = {
     "fast": Preset(
-        (CEM(samples=128, rounds=4, elites=16, decay=1.0),),
-        (CEM(samples=64, rounds=1, elites=16, decay=1.0),),
+        (CEM(samples=32, rounds=16, elites=8, decay=1.0),),
+        (CEM(samples=16, rounds=5, elites=8, decay=1.0),),
         every=5,
     ),
     "balanced": Preset(
-        (CEM(samples=256, rounds=10, elites=24, decay=1.0),),
-        (CEM(samples=128, rounds=3, elites=24, decay=1.0),),
-        every=4,
+        (CEM(samples=64, rounds=16, elites=12, decay=1.0),),
+        (CEM(samples=32, rounds=5, elites=12, decay=1.0),),
+        every=5,
     ),
     "accurate": Preset(
         (CEM(samples=512, rounds=12, elites=32, decay=1.0), Gradient(steps=16, elites=32)),
@@ -120,5 +123,6 @@ def _fit(stages: Sequence[tuple[Stage, float]]) -> list[Stage]:
 
 def _size(optimizer: CEM, factor: float) -> tuple[int, int]:
     """Candidates a round and rounds for so many times the candidates."""
-    rounds = max(1, round(math.sqrt(factor) * optimizer.rounds))
-    return max(8, round(factor * optimizer.samples * optimizer.rounds / rounds)), rounds
+    total = factor * optimizer.samples * optimizer.rounds
+    rounds = max(1, min(round(math.sqrt(factor) * optimizer.rounds), int(total) // LEAST))
+    return max(LEAST, round(total / rounds)), rounds

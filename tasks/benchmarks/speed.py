@@ -44,8 +44,10 @@ DIFFERENTIABLE = ("larp", "mjx", "brax")
 ALONE = ("bullet",)
 # Gradients are asked for up to this batch, accuracy beside the time at it, and memory is shown at it.
 MIDDLE = 512
-# A row's process is ended after so many seconds. Where a step takes so many, larger batches are not asked for.
-SECONDS, SLOW = 300.0, 0.5
+# A row's process is ended after so many seconds, later for a gradient, which compiles for long.
+SECONDS = {False: 120.0, True: 300.0}
+# Where a step takes so many seconds, larger batches are not asked for.
+SLOW = 0.5
 PRESET = "fast"
 STYLES = {"spring": "--", "positional": ":"}
 COLOURS = {"larp": "#d55e00", "mujoco": "#0072b2", "mjx": "#009e73", "brax": "#cc79a7", "bullet": "#7f7f7f"}
@@ -110,10 +112,11 @@ class Asking:
     def asked(self, question: Question) -> report.Row:
         """What the process says, or what became of it."""
         command = [sys.executable, "-m", "tasks.benchmarks.engines", codec.dumps(asdict(question))]
+        most = SECONDS[question.gradient]
         try:
-            done = subprocess.run(command, cwd=report.PROJECT, capture_output=True, text=True, timeout=SECONDS)
+            done = subprocess.run(command, cwd=report.PROJECT, capture_output=True, text=True, timeout=most)
         except subprocess.TimeoutExpired:
-            return {"refused": f"took longer than {SECONDS:.0f} s"}
+            return {"refused": f"took longer than {most:.0f} s"}
         if done.returncode:
             said = (done.stderr.strip() or "nothing").splitlines()[-1]
             return {"refused": f"its process ended with code {done.returncode}: {said}"}
