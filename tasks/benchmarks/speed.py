@@ -33,7 +33,7 @@ from tasks.presets import preset_of
 # Engine steps in a step, by engine; all of Brax's pipelines have the same.
 SUBSTEPS = {"larp": (1,), "mujoco": (2, 4, 5, 10, 20, 40), "mjx": (20,), "brax": (20,), "bullet": (20,)}
 # Those with which kicks are replayed too, beside the above.
-MORE = {"mujoco": (80,), "mjx": (5,), "bullet": (5,)}
+MORE = {"mujoco": (80,), "bullet": (5,)}
 CASES = {
     "ball": (("ball", None),),
     "human": (("human", None),),
@@ -85,7 +85,8 @@ def questions(scenes: list[str], engines: list[str], sizes: list[int], seed: int
     # one batch tells.
     few = [size for size in sizes if size <= MIDDLE]
     for engine in (engine for engine in engines if engine in DIFFERENTIABLE):
-        for name, (scene, reach) in product(variants(engine), cases):
+        # Of the others, Brax takes no other scene and MJX refuses in all of them.
+        for name, (scene, reach) in product(variants(engine), cases if engine == "larp" else cases[:1]):
             for size in few if engine == "larp" and reach == "struck" else few[-1:]:
                 yield Question(name, scene, reach, SUBSTEPS[engine][-1], size, gradient=True, seed=seed)
 
@@ -124,11 +125,11 @@ class Asking:
 
 
 def replayed_by(engines: list[str]) -> list[replays.Engine]:
-    """The engines in which kicks are replayed, with their engine steps; Brax does not take the human."""
+    """The engines in which kicks are replayed, with their engine steps; Brax takes no human, MJX is MuJoCo again."""
     return [
         (engine, substeps)
         for engine in engines
-        if engine != "brax"
+        if engine not in ("brax", "mjx")
         for substeps in (*SUBSTEPS[engine], *MORE.get(engine, ()))
     ]
 
