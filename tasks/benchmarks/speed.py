@@ -222,12 +222,17 @@ def accuracy_table(found: list[report.Row]) -> Table:
 def speed_picture(rows: list[report.Row]) -> Figure:
     """Time per step over the number of simulations side by side, a panel a case."""
     panels = list(dict.fromkeys((row["scene"], row["reach"]) for row in rows))
+    timed = [
+        row
+        for row in rows
+        if row["refused"] is None and not row["gradient"] and row["substeps"] in SUBSTEPS[row["engine"].split()[0]]
+    ]
     figure = Figure(figsize=(3.1 * len(panels) + 0.6, 4.4), layout="constrained")
     drawn = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
     shown: dict[str, Any] = {}
     for axes, (scene, reach) in zip(drawn, panels, strict=True):
-        here = [row for row in rows if (row["scene"], row["reach"]) == (scene, reach) and row["refused"] is None]
-        for name, lines in curves([row for row in here if not row["gradient"]]).items():
+        here = [row for row in timed if (row["scene"], row["reach"]) == (scene, reach)]
+        for name, lines in curves(here).items():
             text, line = draw(axes, name, lines)
             shown.setdefault(text, line)
         where = {"far": ", ball out of reach", "struck": ", ball struck"}.get(reach or "", "")
