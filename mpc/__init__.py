@@ -3,18 +3,24 @@
 from mpc.cem import CEM
 from mpc.cost import CostTerm, absolute, evaluate, l2, nearest_on_path, quadratic
 from mpc.dynamics import Continued, Dynamics, MujocoDynamics
+from mpc.gauss_newton import GaussNewton
 from mpc.gradient import Gradient
+from mpc.mppi import MPPI
 from mpc.planner import Plan, PlanInfo, Planner
+from mpc.search import Optimizer
 from mpc.spline import interpolate, shift
 from mpc.verified import Verified
 
 __all__ = [
     "CEM",
+    "MPPI",
     "Continued",
     "CostTerm",
     "Dynamics",
+    "GaussNewton",
     "Gradient",
     "MujocoDynamics",
+    "Optimizer",
     "Plan",
     "PlanInfo",
     "Planner",

@@ -1,14 +1,12 @@
 """The cross-entropy method with the refinements of iCEM (Pinneri et al. 2020, "Sample-efficient CEM")."""
 
-import itertools
 import math
 from dataclasses import dataclass
-from functools import partial
+from typing import ClassVar
 
-import jax
-import jax.numpy as jnp
+import numpy as np
 
-from mpc.search import Score, Search, best_first, coloured_noise
+from mpc.search import Problem, Search, best_first, coloured_noise
 
 
 @dataclass(frozen=True)
@@ -19,6 +17,8 @@ class CEM:
     (the best always is), momentum on the old distribution, the mean itself tried in the last round, a floor
     on the spread. What comes out is the best candidate, not the mean.
     """
+
+    differentiates: ClassVar[bool] = False
 
     samples: int = 256
     """Candidates of the first round."""
@@ -59,44 +59,37 @@ class CEM:
         """Elites among the candidates of the next round."""
         return max(1, math.ceil(self.keep * self.elites))
 
-    def improve(self, search: Search, key: jax.Array, score: Score) -> tuple[Search, list[jax.Array]]:
-        """All rounds; also returns every candidate's cost, (N,) a round."""
+    def improve(self, search: Search, random: np.random.Generator, problem: Problem) -> Search:
+        """All rounds."""
+        for index, size in enumerate(self.sizes):
+            candidates = self.sample(search, random, size, last=index == self.rounds - 1)
+            search = self.update(search, candidates, problem.tries(candidates).costs)
+        return search
 
-        def one_round(size: int, search: Search, inputs: tuple[jax.Array, jax.Array]) -> tuple[Search, jax.Array]:
-            key, last = inputs
-            candidates = self.sample(search, key, size, last)
-            costs = score(candidates)
-            return self.update(search, candidates, costs), costs
-
-        history: list[jax.Array] = []
-        keys, last = jax.random.split(key, self.rounds), jnp.arange(self.rounds) == self.rounds - 1
-        for size, group in itertools.groupby(self.sizes):
-            rounds = slice(len(history), len(history) + len(list(group)))
-            search, costs = jax.lax.scan(partial(one_round, size), search, (keys[rounds], last[rounds]))
-            history.extend(costs)
-        return search, history
-
-    def sample(self, search: Search, key: jax.Array, size: int, last: jax.Array) -> jax.Array:
+    def sample(self, search: Search, random: np.random.Generator, size: int, last: bool) -> np.ndarray:
         """Candidates (N, K, J, 3) [rad]: the kept elites, best first, draws, and at last the mean."""
-        noise = coloured_noise(key, (size, *search.mean.shape), self.exponent)
+        noise = coloured_noise(random, (size, *search.mean.shape), self.exponent)
         candidates = search.mean + search.spread * noise
-        candidates = candidates.at[: self.kept].set(search.elites[: self.kept])
-        return candidates.at[self.kept].set(jnp.where(last, search.mean, candidates[self.kept]))
+        candidates[: self.kept] = search.elites[: self.kept]
+        if last:
+            candidates[self.kept] = search.mean
+        return candidates
 
-    def update(self, search: Search, candidates: jax.Array, costs: jax.Array) -> Search:
-        """Refits the distribution to the best that are finite; if none is, it and the elites stay."""
+    def update(self, search: Search, candidates: np.ndarray, costs: np.ndarray) -> Search:
+        """Refits the distribution to the best that are finite; if none is, it and the elites stay.
+
+        Where more elites are kept than there are candidates, the last of them stay too.
+        """
         elites, elite_costs = best_first(candidates, costs, len(search.elites))
-        chosen = elites[: self.elites]
-        finite = jnp.isfinite(elite_costs[: self.elites])
-        count = jnp.sum(finite)
-        share = (finite / jnp.maximum(count, 1))[:, None, None, None]
-        mean = jnp.sum(share * chosen, axis=0)
-        spread = jnp.sqrt(jnp.sum(share * (chosen - mean) ** 2, axis=0))
-        mean = self.momentum * search.mean + (1 - self.momentum) * mean
-        spread = self.momentum * search.spread + (1 - self.momentum) * spread
+        count = int(np.isfinite(elite_costs[: self.elites]).sum())
+        if count == 0:
+            return search._replace(costs=np.full(len(search.costs), np.inf, np.float32))
+        chosen = elites[:count][: self.elites]
+        mean = self.momentum * search.mean + (1 - self.momentum) * chosen.mean(axis=0)
+        spread = self.momentum * search.spread + (1 - self.momentum) * chosen.std(axis=0)
         return search._replace(
-            mean=jnp.where(count > 0, mean, search.mean),
-            spread=jnp.where(count > 1, jnp.maximum(spread, self.floor * search.scale), search.spread),
-            elites=jnp.where(count > 0, elites, search.elites),
-            costs=elite_costs,
+            mean=mean,
+            spread=np.maximum(spread, self.floor * search.scale) if count > 1 else search.spread,
+            elites=np.concatenate([elites, search.elites[len(elites) :]]),
+            costs=np.concatenate([elite_costs, np.full(len(search.elites) - len(elites), np.inf, np.float32)]),
         )

@@ -47,14 +47,37 @@ class CostTerm:
 
 
 def residuals(
-    terms: Sequence[CostTerm], states: jax.Array, controls: jax.Array, context: Any = None
+    terms: Sequence[CostTerm],
+    states: jax.Array,
+    controls: jax.Array,
+    context: Any = None,
+    corrections: Mapping[str, jax.Array] | None = None,
 ) -> dict[str, jax.Array]:
-    """Each term's residual of one candidate, (R,) or (T, R)."""
+    """Each term's residual of one candidate, (R,) or (T, R), moved by the correction of its name, if there is one."""
     found = {term.name: term.residual(states, controls, context) for term in terms}
     for name, residual in found.items():
         if residual.ndim not in (1, 2):
             raise ValueError(f"residual of {name!r}: got shape {residual.shape}, needs (R,) or (T, R)")
-    return found
+    return {name: residual + (corrections or {}).get(name, 0.0) for name, residual in found.items()}
+
+
+def weighed(
+    terms: Sequence[CostTerm],
+    found: Mapping[str, jax.Array],
+    states: jax.Array,
+    weights: Mapping[str, jax.Array | float] | None = None,
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Cost of one candidate by its residuals and states (H', L, 13), and each term's weighted share of it.
+
+    `weights` replaces the terms' own by name. The total is +inf where a state or the sum is not finite: such a
+    candidate is never chosen. The shares are reported as they are.
+    """
+    shares = {
+        term.name: (weights or {}).get(term.name, term.weight) * jnp.mean(term.norm(found[term.name])) for term in terms
+    }
+    total = jnp.sum(jnp.stack(list(shares.values())))
+    finite = jnp.isfinite(total) & jnp.all(jnp.isfinite(states))
+    return jnp.where(finite, total, jnp.inf), shares
 
 
 def evaluate(
@@ -63,22 +86,31 @@ def evaluate(
     controls: jax.Array,
     context: Any = None,
     weights: Mapping[str, jax.Array | float] | None = None,
-    corrections: Mapping[str, jax.Array] | None = None,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Cost of one candidate, states (H', L, 13) under controls (H, J, 3), and each term's weighted share.
+    """Cost of one candidate, states (H', L, 13) under controls (H, J, 3), and each term's share: see `weighed`."""
+    return weighed(terms, residuals(terms, states, controls, context), states, weights)
 
-    `weights` replaces the terms' own by name; `corrections` are added to the residuals that they name. The
-    total is +inf where a state or the sum is not finite: such a candidate is never chosen. The shares are
-    reported as they are.
+
+def curvatures(
+    terms: Sequence[CostTerm],
+    found: Mapping[str, jax.Array],
+    weights: Mapping[str, jax.Array | float] | None = None,
+) -> dict[str, jax.Array]:
+    """By residual r, of its shape, c >= 0 so that sum(c r^2) / 2 + constant touches the cost, with its slope.
+
+    The weights of iteratively reweighted least squares (P. Holland and R. Welsch 1977): slope of the norm / r; where r
+    is nearly zero, that ratio a little beside it.
     """
-    shares = {}
-    found = residuals(terms, states, controls, context)
-    for term in terms:
-        residual = found[term.name] + (corrections or {}).get(term.name, 0.0)
-        shares[term.name] = (weights or {}).get(term.name, term.weight) * jnp.mean(term.norm(residual))
-    total = jnp.sum(jnp.stack(list(shares.values())))
-    finite = jnp.isfinite(total) & jnp.all(jnp.isfinite(states))
-    return jnp.where(finite, total, jnp.inf), shares
+
+    def of(term: CostTerm) -> jax.Array:
+        residual = found[term.name]
+        size = jnp.sqrt(jnp.mean(residual**2, axis=-1, keepdims=True))
+        least = jnp.maximum(1e-3 * size, 1e-6)
+        beside = jnp.where(jnp.abs(residual) < least, least, residual)
+        slope = jax.grad(lambda r: (weights or {}).get(term.name, term.weight) * jnp.mean(term.norm(r)))(beside)
+        return jnp.maximum(slope / beside, 0.0)
+
+    return {term.name: of(term) for term in terms}
 
 
 def nearest_on_path(path: Any, point: Any) -> tuple[Any, Any]:

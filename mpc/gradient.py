@@ -2,12 +2,14 @@
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
-import jax
-import jax.numpy as jnp
-import optax
+import numpy as np
 
-from mpc.search import Score, Search, best_first
+from mpc.search import Problem, Search, best_first
+
+# Of RMSprop: share of the old mean square in the new, and what is added to it.
+DECAY, EPSILON = 0.9, 1e-8
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,8 @@ class Gradient:
     median is some 20 per spread, one in ten beyond 1e4, the largest seen 1e29. `clip` holds each knot's part:
     the direction is kept, the size is not believed.
     """
+
+    differentiates: ClassVar[bool] = True
 
     steps: int = 4
     learning_rate: float = 0.05
@@ -40,59 +44,54 @@ class Gradient:
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: got {getattr(self, name)}, needs a finite number > 0")
 
-    def improve(self, search: Search, _key: jax.Array, score: Score) -> tuple[Search, list[jax.Array]]:
-        """All steps; also returns every candidate's cost, (N,) before each step and after the last."""
-
-        def summed(knots: jax.Array) -> tuple[jax.Array, jax.Array]:
-            costs = score(knots)
-            return jnp.sum(costs), costs
-
-        def one_step(carry: Carry, _: None) -> tuple[Carry, jax.Array]:
-            knots, memory, best, best_costs = carry
-            gradient, costs = jax.grad(summed, has_aux=True)(knots)
-            best, best_costs = _cheaper(knots, costs, best, best_costs)
-            knots, memory = self.update(search, knots, gradient, memory)
-            return (knots, memory, best, best_costs), costs
-
-        knots = self.sample(search)
-        start = knots, self._optimizer.init(knots), knots, jnp.full(len(knots), jnp.inf)
-        (knots, _, best, best_costs), history = jax.lax.scan(one_step, start, length=self.steps)
-        costs = score(knots)
-        best, best_costs = _cheaper(knots, costs, best, best_costs)
+    def improve(self, search: Search, _random: np.random.Generator, problem: Problem) -> Search:
+        """All steps: every candidate is tried before each of them and after the last."""
+        best = knots = self.sample(search)
+        best_costs, square = np.full(len(knots), np.inf, np.float32), np.zeros_like(knots)
+        for step in range(self.steps + 1):
+            if step < self.steps:
+                costs, gradient = problem.gradients(knots)
+            else:
+                costs = problem.tries(knots).costs
+            won = costs < best_costs
+            best = np.where(won[:, None, None, None], knots, best)
+            best_costs = np.where(won, costs, best_costs)
+            if step < self.steps:
+                change, square, lost = self.update(search.scale, gradient, square, step)
+                problem.lost(lost)
+                knots = knots + change
         elites, elite_costs = best_first(
-            jnp.concatenate([best, search.elites[len(best) :]]),
-            jnp.concatenate([best_costs, search.costs[len(best) :]]),
+            np.concatenate([best, search.elites[len(best) :]]),
+            np.concatenate([best_costs, search.costs[len(best) :]]),
             len(search.elites),
         )
-        return search._replace(elites=elites, costs=elite_costs), [*history, costs]
+        return search._replace(elites=elites, costs=elite_costs)
 
-    def sample(self, search: Search) -> jax.Array:
+    def sample(self, search: Search) -> np.ndarray:
         """The candidates (N, K, J, 3) [rad] to refine: the best of the search."""
         return search.elites[: self.elites]
 
     def update(
-        self, search: Search, knots: jax.Array, gradient: jax.Array, memory: optax.OptState
-    ) -> tuple[jax.Array, optax.OptState]:
-        """One step of knots (N, K, J, 3) [rad] down the cost's `gradient` [1/rad], in units of the scale."""
-        scaled = gradient * search.scale
-        usable = jnp.all(jnp.isfinite(scaled), axis=(1, 2, 3), keepdims=True)
-        scaled = jnp.where(usable, scaled, 0.0)
-        # Against the clip squared, a large gradient would overflow: divide by its largest component first.
-        largest = jnp.maximum(jnp.max(jnp.abs(scaled), axis=(2, 3), keepdims=True), self.clip)
-        scaled = scaled / largest
-        norm = jnp.sqrt(jnp.sum(scaled**2, axis=(2, 3), keepdims=True))
-        step, memory = self._optimizer.update(scaled * self.clip / jnp.maximum(norm, self.clip / largest), memory)
-        return knots + step * search.scale, memory
+        self, scale: np.ndarray, gradient: np.ndarray, square: np.ndarray, step: int
+    ) -> tuple[np.ndarray, np.ndarray, int]:
+        """A step of knots down the cost's gradient (N, K, J, 3) [1/rad], in units of the scale (J, 3) [rad].
 
-    @property
-    def _optimizer(self) -> optax.GradientTransformation:
-        return optax.rmsprop(self.learning_rate, bias_correction=True)
+        Returns the step [rad], the running mean square, whose start is zero, and how many gradients were not finite.
+        """
+        scaled, lost = self.clipped(gradient * scale)
+        square = DECAY * square + (1.0 - DECAY) * scaled**2
+        mean = square / (1.0 - DECAY ** (step + 1))
+        return -self.learning_rate * scaled / np.sqrt(mean + EPSILON) * scale, square, lost
 
+    def clipped(self, gradient: np.ndarray) -> tuple[np.ndarray, int]:
+        """Gradients (N, K, J, 3), in cost per spread, each knot's at most `clip` long; how many were not finite.
 
-Carry = tuple[jax.Array, optax.OptState, jax.Array, jax.Array]
-
-
-def _cheaper(knots: jax.Array, costs: jax.Array, best: jax.Array, best_costs: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Per candidate the cheaper of two, the best so far in a tie."""
-    won = costs < best_costs
-    return jnp.where(won[:, None, None, None], knots, best), jnp.where(won, costs, best_costs)
+        Those are zero: their candidates stand still.
+        """
+        usable = np.isfinite(gradient).all(axis=(1, 2, 3))
+        gradient = np.where(usable[:, None, None, None], gradient, 0.0)
+        # Squared, a large gradient would overflow 32 bits: divide by its largest component first.
+        largest = np.maximum(np.abs(gradient).max(axis=(2, 3), keepdims=True), self.clip)
+        gradient = gradient / largest
+        norm = np.sqrt((gradient**2).sum(axis=(2, 3), keepdims=True))
+        return gradient * self.clip / np.maximum(norm, self.clip / largest), int((~usable).sum())

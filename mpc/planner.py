@@ -1,7 +1,10 @@
-"""The planner: warm start, then CEM and gradient descent one after the other."""
+"""The planner: a warm start, then its optimisers one after the other."""
+
+from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -11,29 +14,27 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from mpc.cem import CEM
-from mpc.cost import CostTerm, evaluate, require_weight, residuals
+from mpc.cost import CostTerm, curvatures, evaluate, require_weight, residuals, weighed
 from mpc.dynamics import Dynamics
-from mpc.gradient import Gradient
-from mpc.search import Score, Search, coloured_noise
+from mpc.search import Optimizer, Residuals, Search, Tried, coloured_noise
 from mpc.spline import Interpolation, interpolate, shift
-from mpc.verified import Residuals, Verified
+
+# Fewer candidates than this are rolled out as so many, because every size is compiled apart.
+LEAST = 8
 
 
 class Plan(NamedTuple):
     """What is carried from one planning step to the next."""
 
-    elites: jax.Array  # (M, K, J, 3) rad, knots around the reference, best first
-    spread: jax.Array  # (K, J, 3) rad, standard deviation of the search's distribution
-    start: jax.Array  # () s, time of the first knot
-    key: jax.Array  # of the next step's random numbers
+    elites: np.ndarray  # (M, K, J, 3) rad, knots around the reference, best first
+    spread: np.ndarray  # (K, J, 3) rad, standard deviation of the search's distribution
+    start: np.float32  # s, time of the first knot
+    key: np.ndarray  # (W,) words of 32 bits, of the next step's random numbers
 
     @property
-    def knots(self) -> jax.Array:
+    def knots(self) -> np.ndarray:
         """The plan itself (K, J, 3) [rad]: the best candidate, never an average."""
         return self.elites[0]
-
-
-Optimizer = CEM | Gradient | Verified
 
 
 class PlanInfo(NamedTuple):
@@ -42,7 +43,7 @@ class PlanInfo(NamedTuple):
     cost: float  # of the plan; inf where no candidate was finite
     terms: dict[str, float]  # each term's weighted share of the cost
     states: np.ndarray  # (H', L, 13), what the dynamics predict for the plan
-    costs: list[np.ndarray]  # (N,) of all candidates, an array a round or gradient step; inf: not finite
+    costs: list[np.ndarray]  # (N,) of all candidates, an array a round; inf: not finite, or lost for want of a gradient
     elite_costs: np.ndarray  # (M,) of plan.elites; inf where not known
     finite: int  # candidates with a finite cost ...
     candidates: int  # ... of so many
@@ -59,14 +60,14 @@ class Planner:
                               u_h = clip(reference_h + spline(theta, h dt), lower, upper)
 
     theta are `knots` offsets from the reference, evenly spaced from the first control to the last, so that
-    zero is the reference itself. The optimisers run in the order given, each on what the one before it found:
-    `CEM` alone, `Gradient` alone (on random starts around the reference), or CEM and then Gradient on its
-    elites. `Verified`, if any, comes last: the planner's own dynamics propose, truer ones decide.
+    zero is the reference itself. The optimisers run in the order given, each on what the one before it found; the last
+    one ranks the plan. The planner knows none of them: see `search.Optimizer`.
 
     `spread` (J, 3) [rad] is the standard deviation of a first plan's candidates; 0 locks an axis. A later
     plan starts from the last one's spread, widened towards the first by the share `reheat`. `lower` and
-    `upper` (J, 3) [rad] bound the targets. `dt` [s] is the control step. `step` is compiled once for each set
-    of argument shapes: a moving target, weight or reference compiles nothing again.
+    `upper` (J, 3) [rad] bound the targets. `dt` [s] is the control step. What the model does is compiled once for each
+    set of argument shapes and each number of candidates, and shared with the planners that `using` makes: a moving
+    target, weight or reference compiles nothing again.
     """
 
     def __init__(
@@ -86,7 +87,6 @@ class Planner:
         self.dynamics = dynamics
         self.terms = tuple(terms)
         self.horizon = horizon
-        self.optimizers = (optimizers,) if isinstance(optimizers, Optimizer) else tuple(optimizers)
         self.interpolation = interpolation
         self.reheat = reheat
         self.scale = np.asarray(spread, np.float32)
@@ -101,16 +101,36 @@ class Planner:
         self._check()
         self.control_times = dt * np.arange(horizon, dtype=np.float32)
         self.knot_times = np.linspace(0, self.control_times[-1], knots, dtype=np.float32)
-        self.elites = max(optimizer.elites for optimizer in self.optimizers)
-        self._compiled: dict[Any, Any] = {}
+        self._programs = Programs()
         self._controls = jax.jit(self._controls_of)
+        self._use(optimizers)
+
+    def using(self, optimizers: Optimizer | Sequence[Optimizer]) -> Planner:
+        """A planner of the same problem with other optimisers, which shares all that is compiled."""
+        other = object.__new__(Planner)
+        other.__dict__.update(self.__dict__)
+        other._use(optimizers)
+        return other
+
+    def _use(self, optimizers: Optimizer | Sequence[Optimizer]) -> None:
+        self.optimizers: tuple[Optimizer, ...] = (
+            tuple(optimizers) if isinstance(optimizers, Sequence) else (optimizers,)
+        )
+        if not self.optimizers:
+            raise ValueError("optimizers: got none, needs at least one")
+        for each in self.optimizers:
+            if each.differentiates and not self.dynamics.differentiable:
+                names = type(each).__name__, type(self.dynamics).__name__
+                raise ValueError("optimizers: got {}, needs differentiable dynamics, not {}".format(*names))
+        self.elites = max(optimizer.elites for optimizer in self.optimizers)
 
     def init(self, key: jax.Array, now: float = 0.0) -> Plan:
         """The plan that follows the reference from `now` [s]; its other elites are drawn around it."""
-        key, draw = jax.random.split(key)
-        spread = jnp.broadcast_to(self.scale, (len(self.knot_times), *self.scale.shape))
-        elites = coloured_noise(draw, (self.elites, *spread.shape), CEM.exponent) * spread
-        return Plan(elites.at[0].set(0.0), spread, jnp.float32(now), key)
+        random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+        spread = np.broadcast_to(self.scale, (len(self.knot_times), *self.scale.shape))
+        elites = coloured_noise(random, (self.elites, *spread.shape), CEM.exponent) * spread
+        elites[0] = 0.0
+        return Plan(elites, spread, np.float32(now), _entropy(random))
 
     def step(
         self,
@@ -129,24 +149,29 @@ class Planner:
         if given: the dynamics compute no more of them under control. The plan never costs more, in the
         dynamics' eyes, than the last plan carried on. If no candidate is finite, that one returns at cost inf.
         """
-        arguments = self._arguments(plan, state, reference, context, weights, now, steps)
-        compiled, compile_seconds = self._compile(arguments)
-        begin = time.perf_counter()
-        plan, cost, terms, states, costs, elite_costs = jax.block_until_ready(compiled(*arguments))
-        seconds = time.perf_counter() - begin
-        costs = [np.asarray(each) for each in costs]
-        return plan, PlanInfo(
+        wanted = self._wanted(plan, state, reference, context, weights, now, steps)
+        begin, compiled = time.perf_counter(), self._programs.seconds
+        random = np.random.default_rng(plan.key)
+        search = self._shifted(plan, now - float(plan.start))
+        problem = PlannerProblem(self, wanted, search.elites[0])
+        for optimizer in self.optimizers:
+            search = optimizer.improve(search, random, problem)
+        known = np.isfinite(search.costs)[:, None, None, None]
+        after = Plan(np.where(known, search.elites, search.elites[0]), search.spread, np.float32(now), _entropy(random))
+        states = problem.states_of(after.knots)
+        cost, terms = self._run("judge", self._judge, wanted, after.knots, states)
+        compile_seconds = self._programs.seconds - compiled
+        record = problem.record
+        return after, PlanInfo(
             cost=float(cost),
             terms={name: float(value) for name, value in terms.items()},
-            states=np.delete(
-                np.asarray(states), np.s_[self.horizon if steps is None else steps : self.horizon], axis=0
-            ),
-            costs=costs,
-            elite_costs=np.asarray(elite_costs),
-            finite=sum(int(np.isfinite(each).sum()) for each in costs),
-            candidates=sum(len(each) for each in costs),
-            verified=sum(each.rollouts for each in self.optimizers if isinstance(each, Verified)),
-            seconds=seconds,
+            states=np.delete(states, np.s_[self.horizon if steps is None else steps : self.horizon], axis=0),
+            costs=record.costs,
+            elite_costs=search.costs,
+            finite=sum(int(np.isfinite(each).sum()) for each in record.costs),
+            candidates=sum(len(each) for each in record.costs),
+            verified=record.verified,
+            seconds=time.perf_counter() - begin - compile_seconds,
             compile_seconds=compile_seconds,
         )
 
@@ -158,79 +183,78 @@ class Planner:
         weights: Mapping[str, float] | None = None,
         steps: int | None = None,
     ) -> float:
-        """Compiles `step` ahead for arguments of these shapes; returns the seconds it took."""
-        plan = self.init(jax.random.key(0))
-        return self._compile(self._arguments(plan, state, reference, context, weights, 0.0, steps))[1]
+        """Compiles ahead what a plan with arguments of these shapes needs, by planning once; returns the seconds."""
+        _, info = self.step(self.init(jax.random.key(0)), state, reference, context, weights, 0.0, steps)
+        return info.compile_seconds
 
     def controls(self, plan: Plan, reference: ArrayLike) -> jax.Array:
         """Joint targets (H, J, 3) [rad] of the plan, given the reference (H, J, 3) it was made around."""
         return self._controls(plan.knots, self._reference(reference))
 
-    def _plan(
-        self,
-        plan: Plan,
-        state: jax.Array,
-        reference: jax.Array,
-        context: Any,
-        weights: dict[str, jax.Array],
-        now: jax.Array,
-        steps: jax.Array | None,
-    ) -> tuple[Plan, jax.Array, dict[str, jax.Array], jax.Array, list[jax.Array], jax.Array]:
-        """The whole step, traced once: shift, improve, look at the best."""
+    # What is compiled: pure functions of arrays alone.
 
-        def roll_out(dynamics: Dynamics, knots: jax.Array) -> tuple[jax.Array, jax.Array]:
-            controls = jax.vmap(self._controls_of, (0, None))(knots, reference)
-            start = jnp.broadcast_to(state, (len(knots), *state.shape))
-            return dynamics.rollout(start, controls, *([] if steps is None else [steps])), controls
+    def _roll_out(self, dynamics: Dynamics, wanted: Wanted, knots: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """States (N, H', L, 13) and controls (N, H, J, 3) of knots (N, K, J, 3)."""
+        controls = jax.vmap(self._controls_of, (0, None))(knots, wanted.reference)
+        start = jnp.broadcast_to(wanted.state, (len(knots), *wanted.state.shape))
+        return dynamics.rollout(start, controls, *([] if wanted.steps is None else [wanted.steps])), controls
 
-        def score(corrections: Residuals) -> Score:
-            one = partial(evaluate, self.terms, context=context, weights=weights, corrections=corrections)
-            return lambda knots: jax.vmap(one)(*roll_out(self.dynamics, knots))[0]
+    def _weigh(
+        self, wanted: Wanted, states: jax.Array, controls: jax.Array, corrections: Any
+    ) -> tuple[jax.Array, Any, Any]:
+        """Costs, residuals and their curvatures of N candidates, the residuals moved by corrections (N, ...)."""
 
-        def trial(dynamics: Dynamics | None, knots: jax.Array) -> tuple[jax.Array, Residuals]:
-            states, controls = roll_out(dynamics or self.dynamics, knots)
-            costs, _ = jax.vmap(partial(evaluate, self.terms, context=context, weights=weights))(states, controls)
-            return costs, jax.vmap(partial(residuals, self.terms, context=context))(states, controls)
+        def one(states: jax.Array, controls: jax.Array, moved: Any) -> tuple[jax.Array, Any, Any]:
+            found = residuals(self.terms, states, controls, wanted.context, moved)
+            cost, _ = weighed(self.terms, found, states, wanted.weights)
+            return cost, found, curvatures(self.terms, found, wanted.weights)
 
-        key, draw = jax.random.split(plan.key)
-        search = self._shifted(plan, now - plan.start)
-        last, costs = search.elites[0], []
-        for optimizer in self.optimizers:
-            draw, phase = jax.random.split(draw)
-            if isinstance(optimizer, Verified):
-                search, tried = optimizer.improve(search, last, phase, trial, score)
-            else:
-                search, tried = optimizer.improve(search, phase, score({}))
-            costs.extend(tried)
-        elites = jnp.where(jnp.isfinite(search.costs)[:, None, None, None], search.elites, search.elites[0])
-        states, controls = jax.tree.map(lambda leaf: leaf[0], roll_out(self.dynamics, elites[:1]))
-        cost, shares = evaluate(self.terms, states, controls, context, weights)
-        return Plan(elites, search.spread, now, key), cost, shares, states, costs, search.costs
+        return jax.vmap(one)(states, controls, corrections)
 
-    def _shifted(self, plan: Plan, elapsed: jax.Array) -> Search:
-        """The last plan's search as it looks `elapsed` [s] later, its spread widened, its costs unknown."""
+    def _gradients(self, wanted: Wanted, knots: jax.Array, corrections: Any) -> tuple[jax.Array, Any, jax.Array]:
+        def summed(knots: jax.Array) -> tuple[jax.Array, Any]:
+            states, controls = self._roll_out(self.dynamics, wanted, knots)
+            tried = self._weigh(wanted, states, controls, corrections)
+            return jnp.sum(tried[0]), (tried, states)
 
+        gradient, (tried, states) = jax.grad(summed, has_aux=True)(knots)
+        return gradient, tried, states
+
+    def _tangents(self, wanted: Wanted, knots: jax.Array, directions: jax.Array) -> Any:
+        """Derivatives (D, ...) of the residuals at knots (K, J, 3) along directions (D, K, J, 3)."""
+
+        def found(knots: jax.Array) -> Any:
+            states, controls = (leaf[0] for leaf in self._roll_out(self.dynamics, wanted, knots[None]))
+            return residuals(self.terms, states, controls, wanted.context)
+
+        return jax.vmap(lambda direction: jax.jvp(found, (knots,), (direction,))[1])(directions)
+
+    def _judge(self, wanted: Wanted, knots: jax.Array, states: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Cost and each term's share of knots (K, J, 3) that led to states (H', L, 13)."""
+        controls = self._controls_of(knots, wanted.reference)
+        return evaluate(self.terms, states, controls, wanted.context, wanted.weights)
+
+    def _shift(self, elites: jax.Array, spread: jax.Array, elapsed: jax.Array) -> tuple[jax.Array, jax.Array]:
         times = jnp.asarray(self.knot_times)
-        elites = jax.vmap(lambda knots: shift(knots, times, elapsed, self.interpolation))(plan.elites)
-        spread = shift(plan.spread, times, elapsed, "linear")  # a cubic could swing below zero
-        spread = spread + self.reheat * jnp.maximum(self.scale - spread, 0.0)
-        return Search(elites[0], spread, elites, jnp.full(self.elites, jnp.inf), jnp.asarray(self.scale))
+        elites = jax.vmap(lambda knots: shift(knots, times, elapsed, self.interpolation))(elites)
+        return elites, shift(spread, times, elapsed, "linear")  # a cubic could swing below zero
 
     def _controls_of(self, knots: jax.Array, reference: jax.Array) -> jax.Array:
         times = jnp.asarray(self.knot_times), jnp.asarray(self.control_times)
         return jnp.clip(reference + interpolate(knots, *times, self.interpolation), self.lower, self.upper)
 
-    def _compile(self, arguments: tuple) -> tuple[Any, float]:
-        """The compiled step for arguments of these shapes, and the seconds spent on it just now."""
-        leaves, structure = jax.tree.flatten(arguments)
-        signature = structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-        begin = time.perf_counter()
-        if signature in self._compiled:
-            return self._compiled[signature], 0.0
-        self._compiled[signature] = jax.jit(self._plan).lower(*arguments).compile()
-        return self._compiled[signature], time.perf_counter() - begin
+    def _run(self, name: Any, function: Callable[..., Any], *arguments: Any) -> Any:
+        return jax.block_until_ready(self._programs(name, function, *arguments))
 
-    def _arguments(
+    def _shifted(self, plan: Plan, elapsed: float) -> Search:
+        """The last plan's search as it looks `elapsed` [s] later, its spread widened, its costs unknown."""
+        rows = np.minimum(np.arange(self.elites), len(plan.elites) - 1)  # the last planner may have kept more, or fewer
+        given = plan.elites[rows], plan.spread, np.float32(elapsed)
+        elites, spread = map(np.asarray, self._run("shift", self._shift, *given))
+        spread = spread + self.reheat * np.maximum(self.scale - spread, 0.0)
+        return Search(elites[0], spread, elites, np.full(self.elites, np.inf, np.float32), self.scale)
+
+    def _wanted(
         self,
         plan: Plan,
         state: ArrayLike,
@@ -239,14 +263,16 @@ class Planner:
         weights: Mapping[str, float] | None,
         now: float,
         steps: int | None,
-    ) -> tuple:
-        """The public arguments, checked, as JAX arrays of fixed shape and type."""
+    ) -> Wanted:
+        """The public arguments, checked, as arrays of fixed shape and type."""
         state = np.asarray(state, np.float32)
-        if state.ndim != 2 or state.shape[1] != 13 or not np.isfinite(state).all():
-            raise ValueError(f"state: got shape {state.shape}, needs (L, 13), all finite")
-        elites = (self.elites, len(self.knot_times), *self.scale.shape)
-        if plan.elites.shape != elites:
-            raise ValueError(f"plan: got elites {plan.elites.shape}, needs {elites}; it is another planner's")
+        if state.ndim != 2 or state.shape[1] != 13:
+            raise ValueError(f"state: got shape {state.shape}, needs (L, 13)")
+        if not np.isfinite(state).all():
+            raise ValueError("state: got numbers that are not finite, needs all of them finite")
+        knots = (len(self.knot_times), *self.scale.shape)
+        if plan.knots.shape != knots:
+            raise ValueError(f"plan: got knots {plan.knots.shape}, needs {knots}; it is another problem's")
         start = float(plan.start)  # of a clock in 32 bits, hence the tolerance
         if not start - 1e-4 * max(1.0, abs(start)) <= now < np.inf:
             raise ValueError(f"now: got {now} s, needs a time from plan.start, {start} s, on")
@@ -258,14 +284,13 @@ class Planner:
                 raise ValueError(f"weights: got {name!r}, needs names of cost terms: {', '.join(current)}")
             require_weight(name, weight)
             current[name] = float(weight)
-        arrays = state, self._reference(reference), context, current, float(now), steps
-        return plan, *jax.tree.map(_array, arrays)
+        return Wanted(state, self._reference(reference), *jax.tree.map(_array, (context, current, steps)))
 
-    def _reference(self, reference: ArrayLike) -> jax.Array:
+    def _reference(self, reference: ArrayLike) -> ArrayLike:
         shape = (self.horizon, *self.scale.shape)
         if np.shape(reference) != shape:
             raise ValueError(f"reference: got shape {np.shape(reference)}, needs {shape}")
-        return _array(reference)
+        return reference if isinstance(reference, jax.core.Tracer) else _array(reference)
 
     def _check(self) -> None:
         """Refuses what would fail later, or silently, by the name of the argument."""
@@ -280,24 +305,132 @@ class Planner:
         names = [term.name for term in self.terms]
         if not names or len(set(names)) < len(names):
             raise ValueError(f"terms: got {names}, needs at least one, each with its own name")
-        if not self.optimizers:
-            raise ValueError("optimizers: got none, needs CEM, Gradient or both")
-        if any(isinstance(each, Verified) for each in self.optimizers[:-1]):
-            raise ValueError("optimizers: got Verified before another, needs it last")
-        searching = [each.optimizer if isinstance(each, Verified) else each for each in self.optimizers]
-        least = min((min(each.sizes) for each in searching if isinstance(each, CEM)), default=None)
-        for each in searching:
-            if isinstance(each, Gradient) and not self.dynamics.differentiable:
-                model = type(self.dynamics).__name__
-                raise ValueError(f"optimizers: got Gradient, needs differentiable dynamics, not {model}")
-            if least is not None and each.elites > least:
-                raise ValueError(f"optimizers: got {each.elites} elites, CEM's smallest round has {least}")
 
 
-def _array(value: ArrayLike) -> jax.Array:
-    """A JAX array of 32 bits whose type does not depend on whether a Python or a NumPy number came in."""
+class Wanted(NamedTuple):
+    """What one plan is for: arrays of NumPy, and of JAX in what is compiled."""
+
+    state: Any  # (L, 13), where it starts
+    reference: Any  # (H, J, 3) rad
+    context: Any
+    weights: dict[str, Any]
+    steps: Any | None  # (), so many of the H suffice
+
+
+class Programs:
+    """Compiled functions, by name and shapes of arguments, and the seconds that compiling took."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._compiled: dict[Any, Any] = {}
+
+    def __call__(self, name: Any, function: Callable[..., Any], *arguments: Any) -> Any:
+        """What the function gives, compiled first where that is needed; `name` stands for the function."""
+        leaves, structure = jax.tree.flatten(arguments)
+        signature = name, structure, tuple((np.shape(leaf), leaf.dtype) for leaf in leaves)
+        if signature not in self._compiled:
+            begin = time.perf_counter()
+            # The function is kept, too: as long as it is, what its name stands for is.
+            self._compiled[signature] = jax.jit(function).lower(*arguments).compile(), function
+            self.seconds += time.perf_counter() - begin
+        return self._compiled[signature][0](*arguments)
+
+
+@dataclass
+class Record:
+    """What was tried while one plan was made."""
+
+    costs: list[np.ndarray] = field(default_factory=list)
+    verified: int = 0
+    best: dict[bytes, np.ndarray] = field(default_factory=dict)  # states (H', L, 13) by the knots of a round's best
+
+
+@dataclass(frozen=True)
+class PlannerProblem:
+    """The `search.Problem` of one plan."""
+
+    planner: Planner
+    wanted: Wanted
+    carried: np.ndarray
+    correction: Callable[[np.ndarray], Residuals] | None = None
+    record: Record = field(default_factory=Record)
+
+    @property
+    def differentiable(self) -> bool:
+        """See `search.Problem`."""
+        return self.planner.dynamics.differentiable
+
+    def tries(self, knots: np.ndarray) -> Tried:
+        """See `search.Problem`."""
+        return self._tries(self.planner.dynamics, knots, self._corrections(knots), LEAST)
+
+    def gradients(self, knots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `search.Problem`."""
+        gradient, tried, states = self.planner._run(
+            "gradients", self.planner._gradients, self.wanted, knots, self._corrections(knots)
+        )
+        return self._recorded(knots, tried, states).costs, np.asarray(gradient)
+
+    def tangents(self, knots: np.ndarray, directions: np.ndarray) -> Residuals:
+        """See `search.Problem`."""
+        found = self.planner._run("tangents", self.planner._tangents, self.wanted, knots, directions)
+        found = {name: np.asarray(each) for name, each in found.items()}
+        if self.correction is not None:
+            here, there = self.correction(knots[None]), self.correction(knots + directions)
+            found = {name: each + there[name] - here[name] for name, each in found.items()}
+        return found
+
+    def lost(self, count: int) -> None:
+        """See `search.Problem`."""
+        if count:
+            self.record.costs.append(np.full(count, np.inf, np.float32))
+
+    def trials(self, dynamics: Dynamics, knots: np.ndarray) -> Tried:
+        """See `search.Problem`."""
+        self.record.verified += len(knots)
+        return replace(self, record=Record(self.record.costs))._tries(dynamics, knots, {}, 1)
+
+    def corrected(self, correction: Callable[[np.ndarray], Residuals]) -> PlannerProblem:
+        """See `search.Problem`."""
+        return replace(self, correction=correction)
+
+    def states_of(self, knots: np.ndarray) -> np.ndarray:
+        """What the dynamics make of knots (K, J, 3): states (H', L, 13)."""
+        if knots.tobytes() not in self.record.best:
+            self.tries(knots[None])
+        return self.record.best[knots.tobytes()]
+
+    def _corrections(self, knots: np.ndarray) -> Residuals:
+        return {} if self.correction is None else self.correction(knots)
+
+    def _tries(self, dynamics: Dynamics, knots: np.ndarray, corrections: Residuals, least: int) -> Tried:
+        missing = max(0, least - len(knots))
+        padded, moved = jax.tree.map(
+            lambda rows: np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)]), (knots, corrections)
+        )
+        planner, name = self.planner, ("roll out", id(dynamics))
+        states, controls = planner._run(name, partial(planner._roll_out, dynamics), self.wanted, padded)
+        tried = planner._run("weigh", planner._weigh, self.wanted, states, controls, moved)
+        return self._recorded(knots, tried, states)
+
+    def _recorded(self, knots: np.ndarray, tried: Any, states: jax.Array) -> Tried:
+        found = Tried(*jax.tree.map(lambda rows: np.asarray(rows)[: len(knots)], tried))
+        self.record.costs.append(found.costs)
+        best = int(np.argmin(found.costs))
+        self.record.best[knots[best].tobytes()] = np.asarray(states)[best].copy()
+        return found
+
+
+def _entropy(random: np.random.Generator) -> np.ndarray:
+    return random.integers(2**32, size=4, dtype=np.uint32)
+
+
+def _array(value: ArrayLike) -> np.ndarray:
+    """An array of 32 bits whose type does not depend on whether a Python or a NumPy number came in."""
     array = np.asarray(value)
-    return jnp.asarray(array, jnp.float32 if jnp.issubdtype(array.dtype, jnp.floating) else None)
+    if jnp.issubdtype(array.dtype, jnp.floating):
+        return array.astype(np.float32)
+    return array.astype(np.int32) if jnp.issubdtype(array.dtype, jnp.integer) else array
 
 
 def _broadcast(name: str, value: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:

@@ -1,39 +1,115 @@
-"""What the optimisers share: the state of a search, the ranking of candidates, and their noise."""
+"""What optimisers share: the state of a search, what they may ask of a problem, the ranking of candidates, noise.
+
+Optimisers run on the host, in NumPy; the model's work is done by the problem's compiled programs, which all rounds,
+optimisers and planners of a problem share.
+"""
+
+from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-
-Score = Callable[[jax.Array], jax.Array]
-"""Knots (N, K, J, 3) [rad] to costs (N,), +inf for a candidate that is not finite."""
 
 
 class Search(NamedTuple):
     """What one optimiser hands to the next within a plan."""
 
-    mean: jax.Array  # (K, J, 3) rad, centre of the sampling distribution
-    spread: jax.Array  # (K, J, 3) rad, its standard deviation
-    elites: jax.Array  # (M, K, J, 3) rad, the best candidates, best first
-    costs: jax.Array  # (M,) of the elites, +inf while unknown
-    scale: jax.Array  # (J, 3) rad, the spread of a first plan: how far each joint is worth moving
+    mean: np.ndarray  # (K, J, 3) rad, centre of the sampling distribution
+    spread: np.ndarray  # (K, J, 3) rad, its standard deviation
+    elites: np.ndarray  # (M, K, J, 3) rad, the best candidates, best first; first of all, the plan carried on
+    costs: np.ndarray  # (M,) of the elites, +inf while unknown
+    scale: np.ndarray  # (J, 3) rad, the spread of a first plan: how far each joint is worth moving
 
 
-def best_first(knots: jax.Array, costs: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
-    """The `count` cheapest of knots (N, K, J, 3) and their costs (N,); infinite ones last, ties in order."""
-    order = jnp.argsort(costs, stable=True)[:count]
+Residuals = dict[str, np.ndarray]
+"""By term, (N, R) or (N, T, R), of N candidates."""
+
+
+class Tried(NamedTuple):
+    """What N candidates came to."""
+
+    costs: np.ndarray  # (N,), +inf where a candidate is not finite
+    residuals: Residuals
+    curvatures: Residuals  # c of each residual r: near the candidate its cost is a constant + sum(c r^2) / 2
+
+    def row(self, index: int) -> Tried:
+        """One of the candidates alone, N = 1."""
+        residuals, curvatures = (
+            {name: each[index : index + 1] for name, each in values.items()} for values in self[1:]
+        )
+        return Tried(self.costs[index : index + 1], residuals, curvatures)
+
+
+class Problem(Protocol):
+    """What an optimiser may ask. Every cost that is found is counted by the planner."""
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether the planner's dynamics have gradients."""
+
+    def tries(self, knots: np.ndarray) -> Tried:
+        """Knots (N, K, J, 3) [rad], rolled out in the planner's own dynamics."""
+
+    def gradients(self, knots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Costs (N,) of knots (N, K, J, 3) and their gradients (N, K, J, 3) [1/rad], as they are."""
+
+    def tangents(self, knots: np.ndarray, directions: np.ndarray) -> Residuals:
+        """Derivatives of the residuals at knots (K, J, 3) along D directions (D, K, J, 3), (D, ...) by term."""
+
+    def lost(self, count: int) -> None:
+        """So many candidates could not be tried, because a gradient was not finite."""
+
+    @property
+    def carried(self) -> np.ndarray:
+        """Knots (K, J, 3) [rad] of the last plan, carried on."""
+
+    def trials(self, dynamics: Any, knots: np.ndarray) -> Tried:
+        """`tries` in other dynamics, without corrections; counted apart."""
+
+    def corrected(self, correction: Callable[[np.ndarray], Residuals]) -> Problem:
+        """The same problem with something added to the residuals: `correction` of knots (N, K, J, 3), (N, ...)."""
+
+
+class Optimizer(Protocol):
+    """A way to better candidates: whatever is given, what comes out is no worse. Its fields are its settings."""
+
+    @property
+    def differentiates(self) -> bool:
+        """Whether it cannot do without gradients of the dynamics."""
+
+    @property
+    def elites(self) -> int:
+        """How many of the best candidates it needs."""
+
+    def improve(self, search: Search, random: np.random.Generator, problem: Problem) -> Search:
+        """The search after all rounds, its elites ranked by what they cost."""
+
+
+def best_first(knots: np.ndarray, costs: np.ndarray, count: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """The `count` cheapest of knots (N, K, J, 3) and their costs (N,), or all; infinite ones last, ties in order."""
+    order = np.argsort(costs, kind="stable")[:count]
     return knots[order], costs[order]
 
 
-def coloured_noise(key: jax.Array, shape: tuple[int, ...], exponent: float) -> jax.Array:
+def merged(search: Search, knots: np.ndarray, costs: np.ndarray) -> Search:
+    """The search with new candidates (N, K, J, 3) of known costs (N,) among its elites, each once while they last."""
+    count = len(search.elites)
+    both, known = best_first(np.concatenate([search.elites, knots]), np.concatenate([search.costs, costs]), None)
+    _, first = np.unique(both.reshape(len(both), -1), axis=0, return_index=True)
+    again = np.setdiff1d(np.arange(len(both)), first)
+    order = np.concatenate([np.sort(first), again])[:count]
+    return search._replace(elites=both[order], costs=np.where(np.isin(order, again), np.inf, known[order]))
+
+
+def coloured_noise(random: np.random.Generator, shape: tuple[int, ...], exponent: float) -> np.ndarray:
     """Normal noise (N, K, J, 3) of unit variance whose power along the K knots falls as frequency^-exponent.
 
     0 is white, 2 a random walk's: neighbouring knots move together (Pinneri et al. 2020, "iCEM").
     """
-    return jnp.einsum("kl,nljd->nkjd", _colour(shape[1], exponent), jax.random.normal(key, shape))
+    white = random.standard_normal(shape, dtype=np.float32)
+    return np.einsum("kl,nljd->nkjd", _colour(shape[1], exponent), white)
 
 
 @functools.cache

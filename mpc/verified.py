@@ -1,28 +1,22 @@
 """Candidates tried in truer dynamics than the planner's own, and what that teaches the search."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
+import numpy as np
 
-from mpc.cem import CEM
 from mpc.dynamics import Dynamics
-from mpc.gradient import Gradient
-from mpc.search import Score, Search, best_first
-
-Residuals = dict[str, jax.Array]
-Trial = Callable[[Dynamics | None, jax.Array], tuple[jax.Array, Residuals]]
-"""Costs (N,) and residuals (N, ...) of knots (N, K, J, 3) in these dynamics; None: in the planner's own."""
+from mpc.search import Optimizer, Problem, Residuals, Search
 
 
-class Best(NamedTuple):
-    """The cheapest candidate tried so far: knots (K, J, 3) [rad], its cost () and its residuals."""
+class Trial(NamedTuple):
+    """A candidate tried in the truer dynamics: knots (K, J, 3) [rad], its cost and its residuals (1, ...) there."""
 
-    knots: jax.Array
-    cost: jax.Array
+    knots: np.ndarray
+    cost: float
     residuals: Residuals
 
 
@@ -36,73 +30,89 @@ class Verified:
         r(theta) = r_model(theta) + r_true(theta*) - r_model(theta*)
 
     So a model that errs much alike for neighbouring candidates finds a plan that is good in truth after a few trials,
-    as an archer corrects the aim by the last miss (model management of order zero: N. Alexandrov and R. Lewis, "An
+    as an archer corrects the aim by the last miss. With `GaussNewton` as the optimizer a round is a step by the truth's
+    residual and the model's Jacobian, and one candidate suffices (model management: N. Alexandrov and R. Lewis, "An
     Overview of First-Order Model Management for Engineering Optimization", 2001).
     """
 
     dynamics: Dynamics
-    optimizer: CEM | Gradient
+    optimizer: Optimizer
     rounds: int = 3
-    """Trials of candidates; one only ranks what was found."""
+    """Trials of candidates, at most; one only ranks what was found."""
     candidates: int = 8
-    """Tried in each round; the plan that is carried on is one of the first round's."""
+    """Tried in each round, none twice; in the first the plan carried on too, so that none replaces a better one."""
+    enough: tuple[tuple[str, float], ...] = ()
+    """Residuals by name whose length, in truth, ends the trials once it is no more than this."""
 
     def __post_init__(self) -> None:
-        for name, least in {"rounds": 1, "candidates": 2}.items():
+        for name, least in {"rounds": 1, "candidates": 1}.items():
             if getattr(self, name) < least:
                 raise ValueError(f"{name}: got {getattr(self, name)}, needs at least {least}")
+        for name, length in self.enough:
+            if not 0.0 <= length < np.inf:
+                raise ValueError(f"enough: got {length} for {name!r}, needs a finite number >= 0")
+
+    @property
+    def differentiates(self) -> bool:
+        """As its optimizer does."""
+        return self.optimizer.differentiates
 
     @property
     def elites(self) -> int:
         """How many of the best candidates it needs."""
         return max(self.candidates, self.optimizer.elites)
 
-    @property
-    def rollouts(self) -> int:
-        """How many it asks of the truer dynamics."""
-        return self.rounds * self.candidates
+    def improve(self, search: Search, random: np.random.Generator, problem: Problem) -> Search:
+        """All rounds, until one candidate's residuals are `enough`; the elites are ranked by the truer dynamics."""
+        tried: list[Trial] = []
+        proposed = np.concatenate([search.elites[:1], problem.carried[None], search.elites[1:]])
+        for index in range(self.rounds):
+            knots = untried(proposed, tried)[: self.candidates if tried else max(2, self.candidates)]
+            if not len(knots):
+                break
+            found = problem.trials(self.dynamics, knots)
+            for row, each in enumerate(knots):
+                tried.append(Trial(each, float(found.costs[row]), found.row(row).residuals))
+            best = min(tried, key=lambda trial: trial.cost)
+            if index == self.rounds - 1 or self.suffices(best):
+                break
+            inner = problem.corrected(self.correction(best, problem)) if np.isfinite(best.cost) else problem
+            elites = np.concatenate([best.knots[None], search.elites[:-1]])
+            search = search._replace(mean=best.knots, elites=elites, costs=np.full(len(elites), np.inf, np.float32))
+            search = self.optimizer.improve(search, random, inner)
+            proposed = search.elites[np.isfinite(search.costs)]
+        # Where none is finite, the plan carried on stays.
+        tried.sort(key=lambda trial: (trial.cost, not np.array_equal(trial.knots, problem.carried)))
+        return led_by(tried, search)
 
-    def improve(
-        self, search: Search, last: jax.Array, key: jax.Array, trial: Trial, score: Callable[[Residuals], Score]
-    ) -> tuple[Search, list[jax.Array]]:
-        """All rounds; also returns every candidate's cost, (N,) a round, the truer dynamics' and the planner's.
+    def suffices(self, trial: Trial) -> bool:
+        """Whether no further trial is needed."""
+        lengths = [np.linalg.norm(trial.residuals[name]) <= most for name, most in self.enough]
+        return bool(lengths) and np.isfinite(trial.cost) and all(lengths)
 
-        last: knots (K, J, 3) of the plan carried on. score: costs in the planner's own dynamics, corrected.
-        """
-        count = self.candidates
-        elites = jnp.concatenate([search.elites[: count - 1], last[None], search.elites[count - 1 : -1]])
-        _, believed = trial(None, last[None])
-        best = Best(last, jnp.float32(jnp.inf), _first(believed))
-
-        def try_them(search: Search, best: Best) -> tuple[Search, Best, jax.Array]:
-            costs, residuals = trial(self.dynamics, search.elites[:count])
-            first = jnp.argmin(costs)
-            found = Best(search.elites[first], costs[first], jax.tree.map(lambda leaf: leaf[first], residuals))
-            best = jax.tree.map(partial(jnp.where, found.cost < best.cost), found, best)
-            return _ranked(search, best, costs), best, costs
-
-        def one_round(carry: tuple[Search, Best], key: jax.Array) -> tuple[tuple[Search, Best], list[jax.Array]]:
-            search, best, costs = try_them(*carry)
-            _, believed = trial(None, best.knots[None])
-            corrections = jax.tree.map(lambda true, mine: true - mine, best.residuals, _first(believed))
-            search = search._replace(mean=best.knots, costs=jnp.full(len(search.costs), jnp.inf))
-            search, tried = self.optimizer.improve(search, key, score(corrections))
-            return (search, best), [costs, *tried]
-
-        start = search._replace(elites=elites), best
-        # A scan, because every round would be compiled apart.
-        (search, best), rounds = jax.lax.scan(one_round, start, jax.random.split(key, self.rounds - 1))
-        search, _, costs = try_them(search, best)
-        return search, [*(each for column in rounds for each in column), costs]
+    @staticmethod
+    def correction(best: Trial, problem: Problem) -> Callable[[np.ndarray], Residuals]:
+        """What to add to the residuals of the planner's own dynamics so that they are right for the best candidate."""
+        believed = problem.tries(best.knots[None]).residuals
+        apart = {name: true - believed[name] for name, true in best.residuals.items()}
+        return lambda knots: {name: np.repeat(each, len(knots), axis=0) for name, each in apart.items()}
 
 
-def _first(residuals: Residuals) -> Residuals:
-    return jax.tree.map(lambda leaf: leaf[0], residuals)
+def untried(knots: np.ndarray, tried: list[Trial]) -> np.ndarray:
+    """Those of knots (N, K, J, 3) that were not tried yet, in their order, each once."""
+    fresh = {each.tobytes(): each for each in reversed(knots)}  # the first of equals, for the last one written stays
+    for trial in tried:
+        fresh.pop(trial.knots.tobytes(), None)
+    return np.stack(list(reversed(fresh.values()))) if fresh else knots[:0]
 
 
-def _ranked(search: Search, best: Best, costs: jax.Array) -> Search:
-    """The search with its first elites in the order of their costs (N,), the best of all before them."""
-    count = len(costs)
-    tried, costs = best_first(search.elites[:count], costs, count)
-    elites = jnp.concatenate([best.knots[None], tried[:-1], search.elites[count:]])
-    return search._replace(elites=elites, costs=jnp.concatenate([best.cost[None], costs[:-1], search.costs[count:]]))
+def led_by(tried: list[Trial], search: Search) -> Search:
+    """The search with its elites led by what was tried, whose costs alone are known."""
+    rest, count = untried(search.elites, tried), len(search.elites)
+    elites = np.concatenate([np.stack([trial.knots for trial in tried]), rest])
+    costs = np.array([trial.cost for trial in tried] + [np.inf] * len(rest), np.float32)
+    missing = max(0, count - len(elites))
+    return search._replace(
+        elites=np.concatenate([elites, np.repeat(elites[:1], missing, axis=0)])[:count],
+        costs=np.concatenate([costs, np.full(missing, np.inf, np.float32)])[:count],
+    )

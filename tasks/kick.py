@@ -41,8 +41,8 @@ from mpc import (
     Continued,
     CostTerm,
     Dynamics,
-    Gradient,
     MujocoDynamics,
+    Optimizer,
     Planner,
     Verified,
     l2,
@@ -50,7 +50,6 @@ from mpc import (
     quadratic,
 )
 from mpc.loop import Execution, Phase, Replan, Window, execute
-from mpc.planner import Optimizer
 from tasks import references, residuals
 from tasks.data import stray
 from tasks.gap import contact_step, gap, told
@@ -155,8 +154,7 @@ class Kick:
         return at
 
     def planner(self, dynamics: Dynamics, optimizers: tuple[Optimizer, ...]) -> Planner:
-        """A planner of this task; gradient steps are left out where the dynamics have no gradient."""
-        usable = [each for each in optimizers if dynamics.differentiable or not isinstance(each, Gradient)]
+        """A planner of this task; what cannot do without gradients is left out where the dynamics have none."""
         return Planner(
             dynamics,
             self.terms,
@@ -164,7 +162,7 @@ class Kick:
             KNOTS,
             self.scene.dt,
             SEARCH * stray(self.scene),
-            usable,
+            usable(dynamics, optimizers),
             self.lower,
             self.upper,
         )
@@ -283,6 +281,11 @@ class Kick:
         return miss(states[begin:end, self.ball, packed.POSITION], target)
 
 
+def usable(dynamics: Dynamics, optimizers: tuple[Optimizer, ...]) -> list[Optimizer]:
+    """Those of the optimisers that these dynamics serve."""
+    return [each for each in optimizers if dynamics.differentiable or not each.differentiates]
+
+
 def after_contact(contact: int | None, count: int) -> tuple[int, int]:
     """Which of `count` states count for the miss: from first contact, if any, to 2 s after it."""
     return (0, count) if contact is None else (max(contact - 1, 0), min(contact + AFTER_CONTACT + 1, count))
@@ -327,9 +330,10 @@ def planners_of(kick: Kick, preset: Preset, models: Models) -> Planners:
             (*proposing, Verified(truth, preset.correct, rounds, ROWS)) if rounds else proposing
             for proposing, rounds in zip((first, again), preset.verify, strict=True)
         )
+    planner = kick.planner(models.whole, first)
     return Planners(
-        kick.planner(models.whole, first),
-        kick.planner(models.whole, again),
+        planner,
+        planner.using(usable(models.whole, again)),
         preset.every,
         Standing(kick.scene, kick.reference).planner(models.human, preset.stand),
     )

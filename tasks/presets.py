@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from mpc import CEM, Gradient
+from mpc import CEM, GaussNewton, Gradient, Optimizer
 
 # Time of a replan, as a share of the first plan's, where a budget is given.
 AGAIN = 0.2
@@ -16,7 +16,7 @@ LEAST = 8
 CORRECT = CEM(samples=128, rounds=2, elites=16, decay=1.0)
 STAND = CEM(samples=64, rounds=2, elites=12, decay=1.0)
 
-Stage = tuple[CEM | Gradient, ...]
+Stage = tuple[Optimizer, ...]
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Preset:
     again: Stage
     every: int
     verify: tuple[int, int] = (0, 0)
-    correct: CEM | Gradient = CORRECT
+    correct: Optimizer = CORRECT
     stand: Stage = (STAND,)
 
 
@@ -96,33 +96,30 @@ def within(preset: Preset, seconds: float, measure: Callable[[Preset], Seconds])
 
 
 def scaled(preset: Preset, factors: Seconds) -> Preset:
-    """The preset with so many times the candidates in each of its plans.
+    """The preset with so many times the candidates in each of its plans; what is tried in the truth stays."""
+    return replace(
+        preset,
+        first=tuple(fitted(each, factors.first) for each in preset.first),
+        again=tuple(fitted(each, factors.again) for each in preset.again),
+        stand=tuple(fitted(each, factors.stand) for each in preset.stand),
+    )
 
-    Candidates a round and rounds share the factor evenly; what is tried in the truth stays. All rounds of the kick's
-    plans keep the same number of elites, because they hand them on.
+
+def fitted(optimizer: Optimizer, factor: float) -> Optimizer:
+    """An optimiser with so many times the candidates: by its rounds, and by a round's candidates.
+
+    `CEM` shares the factor evenly between both, `GaussNewton` has fewer directions only where no round is left to
+    spare. Anyone's own stays as it is.
     """
-    kick = ((preset.first, factors.first), (preset.again, factors.again))
-    first, again = _fit(kick)
-    (stand,) = _fit([(preset.stand, factors.stand)])
-    return replace(preset, first=first, again=again, stand=stand)
-
-
-def _fit(stages: Sequence[tuple[Stage, float]]) -> list[Stage]:
-    sizes = [_size(each, factor) for stage, factor in stages for each in stage if isinstance(each, CEM)]
-    elites = max(2, min(size // 4 for size, _ in sizes))
-
-    def fit(each: CEM | Gradient, factor: float) -> CEM | Gradient:
-        most = min(each.elites, elites)
-        if isinstance(each, Gradient):
-            return replace(each, elites=most, steps=max(1, round(factor * each.steps)))
-        samples, rounds = _size(each, factor)
-        return replace(each, samples=samples, rounds=rounds, elites=most)
-
-    return [tuple(fit(each, factor) for each in stage) for stage, factor in stages]
-
-
-def _size(optimizer: CEM, factor: float) -> tuple[int, int]:
-    """Candidates a round and rounds for so many times the candidates."""
-    total = factor * optimizer.samples * optimizer.rounds
-    rounds = max(1, min(round(math.sqrt(factor) * optimizer.rounds), int(total) // LEAST))
-    return max(LEAST, round(total / rounds)), rounds
+    if isinstance(optimizer, CEM):
+        total = factor * optimizer.samples * optimizer.rounds
+        rounds = max(1, min(round(math.sqrt(factor) * optimizer.rounds), int(total) // LEAST))
+        samples = max(LEAST, round(total / rounds))
+        return replace(optimizer, samples=samples, rounds=rounds, elites=max(2, min(optimizer.elites, samples // 4)))
+    if isinstance(optimizer, GaussNewton):
+        rounds = max(1, round(factor * optimizer.rounds))
+        share = min(1.0, factor * optimizer.rounds / rounds)
+        return replace(optimizer, rounds=rounds, directions=max(LEAST, round(share * optimizer.directions)))
+    if isinstance(optimizer, Gradient):
+        return replace(optimizer, steps=max(1, round(factor * optimizer.steps)))
+    return optimizer

@@ -20,7 +20,7 @@ from jax import Array
 from larp_model import state as packed
 from larp_model.bodies import standing_height
 from larp_model.scene import Scene
-from mpc import CEM, CostTerm, Dynamics, Gradient, Planner, quadratic
+from mpc import CostTerm, Dynamics, Optimizer, Planner, quadratic
 from mpc.loop import Window
 from tasks import residuals
 from tasks.data import stray
@@ -78,9 +78,9 @@ class Standing:
         }
         return Window(controls, context)
 
-    def planner(self, dynamics: Dynamics, optimizers: tuple[CEM | Gradient, ...]) -> Planner:
+    def planner(self, dynamics: Dynamics, optimizers: tuple[Optimizer, ...]) -> Planner:
         """A planner of this task on dynamics of the human alone."""
-        usable = [each for each in optimizers if dynamics.differentiable or isinstance(each, CEM)]
+        usable = [each for each in optimizers if dynamics.differentiable or not each.differentiates]
         bounds = np.array([(motor.lower, motor.upper) for motor in self.scene.motors])
         return Planner(
             dynamics,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mpc import CEM, CostTerm, Gradient, Plan, Planner, Verified
+from mpc import CEM, CostTerm, GaussNewton, Plan, Planner, Verified
 from mpc.loop import Phase, Window, execute
 
 HORIZON, DT = 6, 0.01
@@ -123,8 +123,9 @@ def test_truer_dynamics_decide_and_their_rollouts_are_counted() -> None:
 def test_each_trial_in_truer_dynamics_corrects_the_aim() -> None:
     model, truth = Mover(85.0), Mover(100.0)
     missed: list[float] = []
+    search = CEM(samples=24, rounds=8, elites=6)  # enough of it, so that what is left is the model's error
     for rounds in (1, 2):
-        planner = _planner(model, (SEARCH, Verified(truth, SEARCH, rounds, candidates=4)))
+        planner = _planner(model, (search, Verified(truth, search, rounds, candidates=4)))
         plan, _ = planner.step(planner.init(jax.random.key(1)), START, np.zeros((HORIZON, 1, 3)), TARGET)
         missed.append(_missed(planner, plan, truth))
     assert missed[1] < 0.4 * missed[0]
@@ -148,15 +149,29 @@ def test_where_no_trial_is_finite_the_last_plan_stays() -> None:
     assert info.finite < info.candidates
 
 
-def test_what_is_verified_comes_last() -> None:
-    with pytest.raises(ValueError, match="optimizers"):
-        _planner(Mover(), (Verified(Mover(50.0), SEARCH), Gradient(steps=1, elites=2)))
+def test_a_step_by_the_truths_residual_and_the_models_slope_needs_few_trials() -> None:
+    model, truth = Mover(85.0), Mover(100.0)
+    step = GaussNewton(rounds=1, directions=12, damping=1e-6)
+    verified = Verified(truth, step, rounds=10, candidates=1, enough=(("miss", 1e-3),))
+    planner = _planner(model, (step, verified))
+    plan, info = planner.step(planner.init(jax.random.key(1)), START, np.zeros((HORIZON, 1, 3)), TARGET)
+    assert _missed(planner, plan, truth) <= 1e-3
+    assert info.verified <= 6  # the plan carried on, and at most five of its own
+
+    # What is enough needs no more than that plan and the one proposed.
+    _, info = planner.step(plan, START, np.zeros((HORIZON, 1, 3)), TARGET)
+    assert info.verified <= 2
 
 
-@pytest.mark.parametrize(("name", "value"), [("rounds", 0), ("candidates", 1)])
+@pytest.mark.parametrize(("name", "value"), [("rounds", 0), ("candidates", 0)])
 def test_too_few_trials_are_refused_by_name(name: str, value: int) -> None:
     with pytest.raises(ValueError, match=name):
-        Verified(Mover(), SEARCH, **{name: value})
+        Verified(Mover(), SEARCH, **{name: value})  # type: ignore[arg-type]
+
+
+def test_a_length_that_is_never_reached_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="enough"):
+        Verified(Mover(), SEARCH, enough=(("miss", np.nan),))
 
 
 def _missed(planner: Planner, plan: Plan, truth: Mover) -> float:

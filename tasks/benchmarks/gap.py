@@ -44,7 +44,7 @@ def candidates_of(
     Returns a row for each plan, and the episodes of all candidates.
     """
     planners = planners_of(kick, preset_of("balanced"), models)
-    spread, random = jnp.asarray(planners.first.scale), np.random.default_rng(seed)
+    spread, random = planners.first.scale, np.random.default_rng(seed)
 
     def costs_in(dynamics: Dynamics) -> Callable[..., tuple[jax.Array, jax.Array]]:
         @jax.jit
@@ -63,8 +63,8 @@ def candidates_of(
         plans = kick.plans(execution)
         for replan in (plans[0], plans[len(plans) // 2], plans[-1]):
             window = kick.window(target)(replan.step)
-            elites = replan.plan.elites[jnp.arange(candidates) % len(replan.plan.elites)]
-            noise = coloured_noise(jax.random.key(seed + index), elites.shape, 2.0)
+            elites = replan.plan.elites[np.arange(candidates) % len(replan.plan.elites)]
+            noise = coloured_noise(np.random.default_rng(seed + index), elites.shape, 2.0)
             tried = elites + AROUND * spread * noise
             controls = jnp.stack(
                 [planners.first.controls(replan.plan._replace(elites=each[None]), window.controls) for each in tried]

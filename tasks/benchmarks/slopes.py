@@ -8,12 +8,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 from larp_model import state as packed
 from larp_model.training import first_contacts
 from mpc import CEM, Dynamics, Gradient, evaluate
-from mpc.search import Search, coloured_noise
+from mpc.search import coloured_noise
 from tasks.benchmarks.pushes import Bench, in_double, row
 from tasks.benchmarks.report import Row
 from tasks.data import random_episodes, stray
@@ -126,7 +125,7 @@ def ball_slopes(bench: Bench) -> list[Row]:
 def candidates(kick: Kick, count: int, seed: int) -> np.ndarray:
     """Knots (count, K, J, 3) [rad] as the planner draws them around the reference."""
     scale = SEARCH * stray(kick.scene)
-    return np.asarray(coloured_noise(jax.random.key(seed), (count, KNOTS, *scale.shape), CEM.exponent)) * scale
+    return coloured_noise(np.random.default_rng(seed), (count, KNOTS, *scale.shape), CEM.exponent) * scale
 
 
 class Slope:
@@ -155,15 +154,10 @@ class Slope:
 
 def update_of(gradient: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """The step (N, K, J, 3), per spread, that the planner takes down a gradient (N, K, J, 3), per spread."""
-    knots, optimizer = jnp.zeros(gradient.shape, jnp.float32), Gradient()
-    spread = jnp.broadcast_to(jnp.asarray(scale), gradient.shape[1:])
-    none = jnp.full(len(gradient), jnp.inf)
-    search = Search(knots[0], spread, knots, none, jnp.asarray(scale))
-    raw = jnp.asarray(np.divide(gradient, scale, where=scale > 0, out=np.zeros_like(gradient)), jnp.float32)
-    moved, _ = optimizer.update(
-        search, knots, raw, optax.rmsprop(optimizer.learning_rate, bias_correction=True).init(knots)
-    )
-    return np.asarray(moved) / np.where(scale > 0, scale, 1.0)
+    scale = np.asarray(scale, np.float32)
+    raw = np.divide(gradient, scale, where=scale > 0, out=np.zeros_like(gradient))
+    moved, _, _ = Gradient().update(scale, raw, np.zeros_like(raw), 0)
+    return moved / np.where(scale > 0, scale, 1.0)
 
 
 def of_kicks(bench: Bench, whole: Dynamics, count: int, seed: int) -> list[Row]:

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from larp_model import weights as stored
 from larp_model.truth.mujoco import SUBSTEPS
-from mpc import CEM, Gradient
+from mpc import CEM, GaussNewton, Gradient, Optimizer
 from tasks.benchmarks import report
 from tasks.data import random_task
 from tasks.kick import BEYOND, FLIGHT, WEIGHTS, Kick, models_of, planners_of, prepare, remember_compilations, run
@@ -58,12 +58,18 @@ class Point:
         return f"{model}: {_told(preset.first)} / {_told(preset.again)} every {preset.every}{trials}"
 
 
-def _told(stage: Sequence[CEM | Gradient]) -> str:
-    """Candidates x rounds of CEM, steps x elites of gradients."""
-    return " + ".join(
-        f"{each.samples}x{each.rounds}" if isinstance(each, CEM) else f"{each.steps} gradients of {each.elites}"
-        for each in stage
-    )
+def _told(stage: Sequence[Optimizer]) -> str:
+    """Candidates x rounds of CEM, steps x elites of gradients, rounds of Gauss-Newton by its directions."""
+
+    def one(each: Optimizer) -> str:
+        if isinstance(each, CEM):
+            return f"{each.samples}x{each.rounds}"
+        if isinstance(each, Gradient):
+            return f"{each.steps} gradients of {each.elites}"
+        assert isinstance(each, GaussNewton)
+        return f"{each.rounds} steps of {each.directions} {each.jacobian}"
+
+    return " + ".join(map(one, stage))
 
 
 def cem(samples: int, rounds: int, elites: int) -> CEM:

@@ -1,0 +1,56 @@
+"""Model predictive path integrals (G. Williams et al. 2018, "Information-Theoretic Model Predictive Control")."""
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from mpc.search import Problem, Search, coloured_noise, merged
+
+
+@dataclass(frozen=True)
+class MPPI:
+    """Draw candidates around the mean, move it to their average, each weighted by exp(-cost / temperature).
+
+    The spread stays as it is. The mean is a candidate in the next round, and what comes out is the best candidate.
+    """
+
+    differentiates: ClassVar[bool] = False
+
+    samples: int = 64
+    """Candidates of a round."""
+    rounds: int = 4
+    temperature: float = 0.1
+    """In units of the standard deviation of a round's finite costs."""
+    exponent: float = 2.0
+    """Colour of the noise; 0 is white."""
+    elites: int = 8
+    """Of the best candidates, so many are kept."""
+
+    def __post_init__(self) -> None:
+        least_of = {"samples": 2, "rounds": 1, "elites": 1, "temperature": 1e-6, "exponent": 0}
+        for name, least in least_of.items():
+            if not least <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: got {getattr(self, name)}, needs a finite number >= {least:g}")
+
+    def improve(self, search: Search, random: np.random.Generator, problem: Problem) -> Search:
+        """All rounds, and the last mean tried."""
+        search = search._replace(mean=search.elites[0])
+        for _ in range(self.rounds):
+            noise = coloured_noise(random, (self.samples, *search.mean.shape), self.exponent)
+            candidates = search.mean + search.spread * noise
+            candidates[0] = search.mean
+            costs = problem.tries(candidates).costs
+            search = self.update(merged(search, candidates, costs), candidates, costs)
+        last = search.mean[None]
+        return merged(search, last, problem.tries(last).costs)
+
+    def update(self, search: Search, candidates: np.ndarray, costs: np.ndarray) -> Search:
+        """The search with its mean at the weighted average; where no candidate is finite it stays."""
+        finite = np.isfinite(costs)
+        if not finite.any():
+            return search
+        unit = self.temperature * max(float(costs[finite].std()), 1e-12)
+        weight = np.exp((costs[finite].min() - costs) / unit)  # of an infinite cost 0
+        return search._replace(mean=np.einsum("n,nkjd->kjd", weight / weight.sum(), candidates))
