@@ -42,7 +42,7 @@ class GaussNewton:
     rounds: int = 3
     directions: int = 24
     jacobian: Literal["forward", "differences"] = "differences"
-    step: float = 0.1
+    step: float = 0.02
     """Of the differences, in spreads."""
     damping: float = 1e-2
     """At first, as a share of the curvature's mean over the directions."""

@@ -297,17 +297,19 @@ def miss(path: np.ndarray, target: np.ndarray) -> float:
 
 
 def models_of(
-    scene: Scene, name: DynamicsName, weights: Path, trained_on: Scene | None = None, substeps: int = SUBSTEPS
-) -> Models:
+    scene: Scene, name: DynamicsName, weights: Path, trained_on: Scene | None = None, substeps: int = SUBSTEPS,
+    rows: int = ROWS,
+) -> Models:  # fmt: skip
     """The planners' models; that of the scene goes on with the ball alone once no link can reach it any more.
 
-    trained_on: the scene of the weights, where that is another one. substeps: engine steps in a step of MuJoCo.
+    trained_on: the scene of the weights, where that is another one. substeps: engine steps in a step of MuJoCo. rows:
+    candidates that it rolls out side by side.
     """
     human, ball = scene.bodies[0].name, scene.bodies[-1].name
 
     def model(*bodies: str) -> Dynamics:
         part = scene.only(*bodies)
-        return MujocoDynamics(Truth(part, ROWS, substeps)) if name == "mujoco" else Simulator(part, config, learned)
+        return MujocoDynamics(Truth(part, rows, substeps)) if name == "mujoco" else Simulator(part, config, learned)
 
     if name == "larp":
         config, learned, manifest = stored.load(weights, trained_on or scene)
@@ -325,9 +327,11 @@ def planners_of(kick: Kick, preset: Preset, models: Models) -> Planners:
     first: tuple[Optimizer, ...] = preset.first
     again: tuple[Optimizer, ...] = preset.again
     if any(preset.verify) and models.learned:
-        truth = models_of(kick.scene, "mujoco", Path(), substeps=kick.substeps).whole
+        rows = max(2, preset.candidates)  # the plan carried on is tried beside the first proposal
+        truth = models_of(kick.scene, "mujoco", Path(), substeps=kick.substeps, rows=rows).whole
+        enough = (("target", preset.enough),)
         first, again = (
-            (*proposing, Verified(truth, preset.correct, rounds, ROWS)) if rounds else proposing
+            (*proposing, Verified(truth, preset.correct, rounds, preset.candidates, enough)) if rounds else proposing
             for proposing, rounds in zip((first, again), preset.verify, strict=True)
         )
     planner = kick.planner(models.whole, first)

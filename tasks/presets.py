@@ -13,7 +13,7 @@ from mpc import CEM, GaussNewton, Gradient, Optimizer
 AGAIN = 0.2
 # Candidates of the smallest round.
 LEAST = 8
-CORRECT = CEM(samples=128, rounds=2, elites=16, decay=1.0)
+STEPS = GaussNewton(rounds=2, directions=24)
 STAND = CEM(samples=64, rounds=2, elites=12, decay=1.0)
 
 Stage = tuple[Optimizer, ...]
@@ -23,37 +23,26 @@ Stage = tuple[Optimizer, ...]
 class Preset:
     """How much a plan may cost: the optimisers of the first plan and of each replan, and steps between replans.
 
-    verify: rounds of trials in the truth of the first plan and of each replan, 0 for none. correct: what searches on
-    between two of them. stand: optimisers of the plans that keep the human up after the kick.
+    verify: rounds of trials in the truth of the first plan and of each replan, at most; 0 for none. correct: what
+    searches on between two of them. candidates: tried in a round. enough: a miss, in truth, that ends them [m]. stand:
+    optimisers of the plans that keep the human up after the kick.
     """
 
     first: Stage
     again: Stage
     every: int
     verify: tuple[int, int] = (0, 0)
-    correct: Optimizer = CORRECT
+    correct: Optimizer = STEPS
+    candidates: int = 1
+    enough: float = 0.004
     stand: Stage = (STAND,)
 
 
-# Points of `tasks.benchmarks.tradeoff`: many rounds of few candidates do better than few rounds of many. One population
-# size throughout, because every size is compiled apart.
+# Points of `tasks.benchmarks.tradeoff`. Of one number of directions, because every number is compiled apart.
 PRESETS = {
-    "fast": Preset(
-        (CEM(samples=32, rounds=16, elites=8, decay=1.0),),
-        (CEM(samples=16, rounds=5, elites=8, decay=1.0),),
-        every=5,
-    ),
-    "balanced": Preset(
-        (CEM(samples=64, rounds=16, elites=12, decay=1.0),),
-        (CEM(samples=32, rounds=5, elites=12, decay=1.0),),
-        every=5,
-    ),
-    "accurate": Preset(
-        (CEM(samples=512, rounds=12, elites=32, decay=1.0), Gradient(steps=16, elites=32)),
-        (CEM(samples=256, rounds=4, elites=32, decay=1.0),),
-        every=2,
-        verify=(4, 2),
-    ),
+    "fast": Preset((GaussNewton(rounds=6),), (GaussNewton(rounds=1),), every=5),
+    "balanced": Preset((GaussNewton(rounds=12),), (GaussNewton(rounds=1),), every=1),
+    "accurate": Preset((GaussNewton(rounds=12),), (GaussNewton(rounds=1),), every=5, verify=(8, 3)),
 }
 
 

@@ -28,11 +28,14 @@ from larp_model.simulator import Simulator, Weights
 from larp_model.truth import episodes as truth_episodes
 from larp_model.truth.episodes import Episodes
 from larp_model.truth.mujoco import SUBSTEPS, Truth
+from mpc import CEM
 from tasks.data import WINDOWS, contact_episodes, random_episodes, random_task
 from tasks.kick import WEIGHTS, Kick, models_of, planners_of, prepare, remember_compilations, run
-from tasks.presets import preset_of
+from tasks.presets import Preset
 
 EVALUATION_SEED = 1
+# How the planner searches for the candidates that it is trained on: by sampling, for a step by gradients tries few.
+CANDIDATES = Preset((CEM(256, 10, 24, 1.0),), (CEM(128, 3, 24, 1.0),), every=4)
 # Errors of a velocity count linearly: the median launch matters, not the worst.
 LOSS = LossWeights(velocity=1e-2, far=0.05, fast=0.1, arm=0.14)
 
@@ -77,7 +80,7 @@ def planned_episodes(kick: Kick, weights: Path, tasks: int, elites: int, seed: i
     Returns the episodes, of the plans' horizon, and how many diverged.
     """
     random = np.random.default_rng(seed)
-    planners = planners_of(kick, preset_of("balanced"), models_of(kick.scene, "larp", weights))
+    planners = planners_of(kick, CANDIDATES, models_of(kick.scene, "larp", weights))
     states, controls = [], []
     for index in range(tasks):
         target, shift = random_task(random)

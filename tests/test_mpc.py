@@ -512,7 +512,7 @@ def test_planners_of_one_problem_share_what_is_compiled() -> None:
     first = _planner(optimizers=CEM(samples=16, rounds=2, elites=3, decay=1.0))
     plan, info = first.step(first.init(jax.random.key(0)), STATE, REFERENCE, TARGET)
     again = first.using((MPPI(samples=16, rounds=3, elites=3), GaussNewton(directions=16, elites=3)))
-    first.using(MPPI(samples=2, rounds=1)).compile(STATE, REFERENCE, TARGET)  # fewer than `LEAST`: one size
+    first.using(MPPI(samples=2, rounds=1)).compile(STATE, REFERENCE, TARGET)  # few: one size
     _, second = again.step(plan, STATE, REFERENCE, TARGET)
     assert info.compile_seconds > 0 and second.compile_seconds == 0
     assert second.cost <= info.cost

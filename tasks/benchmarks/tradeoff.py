@@ -15,7 +15,7 @@ from rich.table import Table
 
 from larp_model import weights as stored
 from larp_model.truth.mujoco import SUBSTEPS
-from mpc import CEM, GaussNewton, Gradient, Optimizer
+from mpc import CEM, MPPI, GaussNewton, Gradient, Optimizer
 from tasks.benchmarks import report
 from tasks.data import random_task
 from tasks.kick import BEYOND, FLIGHT, WEIGHTS, Kick, models_of, planners_of, prepare, remember_compilations, run
@@ -24,8 +24,8 @@ from tasks.presets import PRESETS, Preset
 # A preset moves where another point is so much better in both error and time.
 BETTER = 0.1
 FAMILIES = {
-    "larp": ("LARP", "o", "#0072b2"),
-    "gradient": ("LARP, with gradient steps", "s", "#009e73"),
+    "sampling": ("LARP, sampling", "o", "#0072b2"),
+    "gradient": ("LARP, with gradients", "s", "#009e73"),
     "verified": ("LARP, verified in MuJoCo", "D", "#d55e00"),
     "mujoco": ("MuJoCo as the model", "^", "#7f7f7f"),
 }
@@ -47,29 +47,38 @@ class Point:
         if any(self.preset.verify):
             return "verified"
         stages = (*self.preset.first, *self.preset.again)
-        return "gradient" if any(isinstance(each, Gradient) for each in stages) else "larp"
+        return "gradient" if any(isinstance(each, GaussNewton | Gradient) for each in stages) else "sampling"
 
     @property
     def name(self) -> str:
-        """Model, optimisers of the first plan and of each replan, steps between replans, rounds of trials in truth."""
+        """Model, optimisers of the first plan and of each replan, steps between replans, trials in the truth."""
         preset = self.preset
         model = "larp" if self.dynamics == "larp" else f"mujoco {self.substeps}"
-        trials = f", trials {preset.verify[0]} / {preset.verify[1]}" if any(preset.verify) else ""
+        trials = ""
+        if any(preset.verify):
+            trials = ", trials {} / {} of {} to {:g} mm by {}".format(
+                *preset.verify, preset.candidates, 1e3 * preset.enough, _told((preset.correct,))
+            )
         return f"{model}: {_told(preset.first)} / {_told(preset.again)} every {preset.every}{trials}"
 
 
 def _told(stage: Sequence[Optimizer]) -> str:
-    """Candidates x rounds of CEM, steps x elites of gradients, rounds of Gauss-Newton by its directions."""
+    """Candidates x rounds of sampling, steps x elites of gradients; rounds, directions and step of Gauss-Newton."""
 
     def one(each: Optimizer) -> str:
-        if isinstance(each, CEM):
-            return f"{each.samples}x{each.rounds}"
-        if isinstance(each, Gradient):
-            return f"{each.steps} gradients of {each.elites}"
-        assert isinstance(each, GaussNewton)
-        return f"{each.rounds} steps of {each.directions} {each.jacobian}"
+        match each:
+            case CEM():
+                return f"CEM {each.samples}x{each.rounds}"
+            case MPPI():
+                return f"MPPI {each.samples}x{each.rounds}"
+            case Gradient():
+                return f"RMSprop {each.elites}x{each.steps}"
+            case GaussNewton():
+                slopes = "forward" if each.jacobian == "forward" else f"step {each.step:g}"
+                return f"GN {each.directions}x{each.rounds} {slopes}"
+        raise ValueError(f"optimizer is {each}, but must be one that has a name here")
 
-    return " + ".join(map(one, stage))
+    return " + ".join(map(one, stage)) or "nothing"
 
 
 def cem(samples: int, rounds: int, elites: int) -> CEM:
@@ -83,39 +92,57 @@ def points() -> tuple[Point, ...]:
 
 
 def _around() -> Iterator[Point]:
-    # More candidates, more rounds.
-    for samples, rounds, elites in (
-        (32, 4, 8), (32, 16, 8), (64, 2, 12), (64, 4, 12), (64, 8, 12), (64, 16, 12), (128, 2, 16),
-        (128, 4, 16), (128, 8, 16), (256, 4, 24), (512, 4, 32),
-    ):  # fmt: skip
-        again = cem(max(2 * elites, samples // 2), max(1, rounds // 3), elites)
-        yield Point(Preset((cem(samples, rounds, elites),), (again,), every=5))
-    quick, few = cem(128, 4, 16), cem(64, 1, 16)
-    wide, some = cem(256, 10, 24), cem(128, 3, 24)
-    deep, deeper, rest = cem(64, 8, 12), cem(64, 16, 12), cem(32, 2, 12)
-    # More replans.
+    newton = GaussNewton
+    once, twice, few = newton(rounds=1), newton(rounds=2), cem(16, 5, 8)
+
+    def larp(*first: Optimizer, again: Optimizer = once, every: int = 5, **verified: Any) -> Point:
+        return Point(Preset(first, (again,), every, **verified))
+
+    # Sampling alone.
+    for samples, rounds, elites in ((32, 4, 8), (32, 16, 8), (64, 8, 12), (64, 16, 12), (64, 32, 12), (128, 8, 16)):
+        yield larp(cem(samples, rounds, elites), again=cem(max(2 * elites, samples // 2), max(1, rounds // 3), elites))
+    yield larp(MPPI(samples=64, rounds=16), again=MPPI(samples=32, rounds=5))
+    # Gauss-Newton: rounds, directions, the step of its differences, forward derivatives.
+    for rounds, directions in (
+        (1, 24),
+        (2, 24),
+        (3, 24),
+        (4, 24),
+        (9, 24),
+        (12, 24),
+        (24, 24),
+        (6, 8),
+        (9, 16),
+        (12, 32),
+    ):
+        yield larp(newton(rounds=rounds, directions=directions), again=newton(rounds=1, directions=directions))
+    for step in (0.005, 0.1, 0.3):
+        yield larp(newton(rounds=12, step=step), again=newton(rounds=1, step=step))
+    for rounds in (6, 12):
+        forward = newton(rounds=rounds, jacobian="forward")
+        yield larp(forward, again=newton(rounds=1, jacobian="forward"))
+    # More replans, and what they do.
     for every in (1, 2, 3, 8, 12):
-        yield Point(Preset((quick,), (few,), every))
-    yield Point(Preset((quick,), (cem(128, 2, 16),), every=5))
-    for every, again in ((4, some), (8, some), (4, cem(128, 1, 24))):
-        yield Point(Preset((wide,), (again,), every))
-    # Gradients.
-    for elites, steps in ((8, 4), (8, 8), (16, 8)):
-        yield Point(Preset((quick, Gradient(steps=steps, elites=elites)), (few,), every=5))
-    yield Point(Preset((quick,), (few, Gradient(steps=2, elites=8)), every=5))
-    yield Point(Preset((Gradient(steps=16, elites=32),), (Gradient(steps=4, elites=32),), every=5))
+        yield larp(newton(rounds=6), every=every)
+    for again in (twice, newton(rounds=4), few):
+        yield larp(newton(rounds=6), again=again)
+    # After sampling, and other gradients.
+    yield larp(cem(32, 4, 8), newton(rounds=4))
+    yield larp(cem(32, 8, 8), newton(rounds=6))
+    yield larp(Gradient(steps=16, elites=8), again=Gradient(steps=2, elites=8))
     # Trials in the truth.
-    for verify in ((1, 1), (2, 1), (4, 2)):
-        yield Point(Preset((quick,), (few,), every=5, verify=verify))
-    for first, every, verify in ((deep, 5, (2, 2)), (deep, 5, (4, 2)), (deeper, 2, (4, 2))):
-        yield Point(Preset((first,), (rest,), every, verify))
-    most = cem(512, 12, 32), Gradient(steps=16, elites=32)
-    yield Point(Preset(most, (cem(256, 4, 32),), every=2, verify=(4, 2)))
-    # MuJoCo as the model; at 20 engine steps the largest of these searches takes minutes a kick.
-    sizes = (cem(64, 2, 12), cem(32, 1, 12)), (cem(128, 2, 16), few), (quick, few)
-    for substeps, count in ((5, 3), (10, 3), (20, 2)):
-        for first, again in sizes[:count]:
-            yield Point(Preset((first,), (again,), every=5), "mujoco", substeps)
+    for verify, enough in (((2, 1), 0.004), ((4, 1), 0.004), ((8, 1), 0.004), ((8, 3), 0.01), ((8, 3), 0.002)):
+        yield larp(newton(rounds=6), verify=verify, enough=enough)
+    yield larp(newton(rounds=6), verify=(8, 3), candidates=2)
+    yield larp(newton(rounds=6), verify=(8, 3), every=12)
+    rest = cem(32, 2, 12)
+    yield larp(cem(64, 8, 12), again=rest, verify=(2, 2), correct=cem(128, 2, 16), candidates=8, enough=0.0)
+    # MuJoCo as the model.
+    for substeps in (5, 10, 20):
+        for first in (twice, newton(rounds=6)):
+            yield Point(Preset((first,), (once,), every=5), "mujoco", substeps)
+    for substeps in (5, 10):
+        yield Point(Preset((cem(64, 8, 12),), (few,), every=5), "mujoco", substeps)
 
 
 def measure(kick: Kick, point: Point, weights: Path, targets: int, seed: int) -> report.Row:
