@@ -30,9 +30,10 @@ class Verified:
         r(theta) = r_model(theta) + r_true(theta*) - r_model(theta*)
 
     So a model that errs much alike for neighbouring candidates finds a plan that is good in truth after a few trials,
-    as an archer corrects the aim by the last miss. With `GaussNewton` as the optimizer a round is a step by the truth's
-    residual and the model's Jacobian, and one candidate suffices (model management: N. Alexandrov and R. Lewis, "An
-    Overview of First-Order Model Management for Engineering Optimization", 2001).
+    as an archer corrects the aim by the last miss. Where proposals turn out worse, half of the way to them is tried
+    next. With `GaussNewton` as the optimizer a round is a step by the truth's residual and the model's Jacobian, and
+    one candidate suffices (model management: N. Alexandrov and R. Lewis, "An Overview of First-Order Model Management
+    for Engineering Optimization", 2001).
     """
 
     dynamics: Dynamics
@@ -76,6 +77,9 @@ class Verified:
             best = min(tried, key=lambda trial: trial.cost)
             if index == self.rounds - 1 or self.suffices(best):
                 break
+            if index and not any(best is trial for trial in tried[-len(knots) :]) and np.isfinite(best.cost):
+                proposed = 0.5 * (best.knots + knots)
+                continue
             inner = problem.corrected(self.correction(best, problem)) if np.isfinite(best.cost) else problem
             elites = np.concatenate([best.knots[None], search.elites[:-1]])
             search = search._replace(mean=best.knots, elites=elites, costs=np.full(len(elites), np.inf, np.float32))

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from mpc import CEM, GaussNewton, Gradient, Optimizer
+from mpc import CEM, MPPI, GaussNewton, Gradient, Optimizer
 
 # Time of a replan, as a share of the first plan's, where a budget is given.
 AGAIN = 0.2
@@ -97,18 +97,20 @@ def scaled(preset: Preset, factors: Seconds) -> Preset:
 def fitted(optimizer: Optimizer, factor: float) -> Optimizer:
     """An optimiser with so many times the candidates: by its rounds, and by a round's candidates.
 
-    `CEM` shares the factor evenly between both, `GaussNewton` has fewer directions only where no round is left to
+    Sampling shares the factor evenly between both, `GaussNewton` has fewer directions only where no round is left to
     spare. Anyone's own stays as it is.
     """
-    if isinstance(optimizer, CEM):
-        total = factor * optimizer.samples * optimizer.rounds
-        rounds = max(1, min(round(math.sqrt(factor) * optimizer.rounds), int(total) // LEAST))
-        samples = max(LEAST, round(total / rounds))
-        return replace(optimizer, samples=samples, rounds=rounds, elites=max(2, min(optimizer.elites, samples // 4)))
-    if isinstance(optimizer, GaussNewton):
-        rounds = max(1, round(factor * optimizer.rounds))
-        share = min(1.0, factor * optimizer.rounds / rounds)
-        return replace(optimizer, rounds=rounds, directions=max(LEAST, round(share * optimizer.directions)))
-    if isinstance(optimizer, Gradient):
-        return replace(optimizer, steps=max(1, round(factor * optimizer.steps)))
+    match optimizer:
+        case CEM() | MPPI():
+            total = factor * optimizer.samples * optimizer.rounds
+            rounds = max(1, min(round(math.sqrt(factor) * optimizer.rounds), int(total) // LEAST))
+            samples = max(LEAST, round(total / rounds))
+            elites = max(2, min(optimizer.elites, samples // 4))
+            return replace(optimizer, samples=samples, rounds=rounds, elites=elites)
+        case GaussNewton():
+            rounds = max(1, round(factor * optimizer.rounds))
+            share = min(1.0, factor * optimizer.rounds / rounds)
+            return replace(optimizer, rounds=rounds, directions=max(LEAST, round(share * optimizer.directions)))
+        case Gradient():
+            return replace(optimizer, steps=max(1, round(factor * optimizer.steps)))
     return optimizer

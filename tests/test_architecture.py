@@ -75,6 +75,7 @@ ORDER = [
     "tasks.benchmarks.replays",
     "tasks.benchmarks.speed",
     "tasks.benchmarks.tradeoff",
+    "tasks.benchmarks.optimizers",
     "tasks.benchmarks.pushes",
     "tasks.benchmarks.slopes",
     "tasks.benchmarks.stability",

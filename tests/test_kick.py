@@ -82,6 +82,18 @@ def test_tasks_are_drawn_within_the_protocols_bounds() -> None:
         assert (np.abs(shift) <= 0.03).all()
 
 
+def test_with_the_shipped_weights_fast_hits_its_targets_and_stays_near_the_reference(task: kick.Kick) -> None:
+    models = kick.models_of(task.scene, "larp", stored.SHIPPED / f"{kick.WEIGHTS}.json")
+    planners, random, reports = kick.planners_of(task, preset_of("fast"), models), np.random.default_rng(5), []
+    for seed in range(3):
+        target, shift = random_task(random)
+        reports.append(task.report(task.run(planners, target, seed, task.start(shift), stands=False), target))
+    assert np.mean([report["truth_error_m"] for report in reports]) <= 0.08
+    assert max(report["reference_deviation_m"] for report in reports) <= 0.05
+    assert sum(report["compile_seconds"] for report in reports) > 0.0
+    assert all(report["candidates_lost"] == report["truth_rollouts"] == 0 for report in reports)
+
+
 def test_with_the_truth_as_model_what_is_predicted_happens(task: kick.Kick, small: None) -> None:
     models = kick.models_of(task.scene, "mujoco", stored.SHIPPED, substeps=task.substeps)
     planners = kick.planners_of(task, preset_of("fast"), models)

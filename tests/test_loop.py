@@ -163,6 +163,17 @@ def test_a_step_by_the_truths_residual_and_the_models_slope_needs_few_trials() -
     assert info.verified <= 2
 
 
+def test_where_the_model_makes_steps_too_long_they_are_halved_until_they_help() -> None:
+    model, truth = Mover(30.0), Mover(100.0)
+    step = GaussNewton(rounds=1, directions=12, damping=1e-6)
+    missed: list[float] = []
+    for rounds in (1, 20):  # each cycle of overshooting and halving leaves two thirds of the miss
+        planner = _planner(model, (step, Verified(truth, step, rounds, candidates=1)))
+        plan, _ = planner.step(planner.init(jax.random.key(1)), START, np.zeros((HORIZON, 1, 3)), TARGET)
+        missed.append(_missed(planner, plan, truth))
+    assert missed[1] < 0.05 * missed[0]
+
+
 @pytest.mark.parametrize(("name", "value"), [("rounds", 0), ("candidates", 0)])
 def test_too_few_trials_are_refused_by_name(name: str, value: int) -> None:
     with pytest.raises(ValueError, match=name):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from larp_model import weights as stored
 from mpc import CEM
 from tasks import kick
-from tasks.benchmarks import report, tradeoff
+from tasks.benchmarks import optimizers, report, tradeoff
 from tasks.benchmarks.tradeoff import Point
 from tasks.presets import PRESETS, Preset
 
@@ -58,10 +60,18 @@ def test_a_point_is_measured_and_drawn(tmp_path: Path) -> None:
     search = (CEM(samples=16, rounds=1, elites=4),)
     point = Point(Preset(search, search, every=40), "mujoco", 4)
     row = tradeoff.measure(kick.prepare(substeps=4), point, Path(), targets=2, seed=0)
-    assert row["point"] == "mujoco 4: 16x1 / 16x1 every 40" and row["family"] == "mujoco"
+    assert row["point"] == "mujoco 4: CEM 16x1 / CEM 16x1 every 40" and row["family"] == "mujoco"
     assert len(row["truth_errors_m"]) == 2
     assert row["planning_seconds"] >= row["plan_seconds"] > 0.0
     report.write_picture(tmp_path / "front.png", tradeoff.picture([row], {row["point"]: "some"}, 2))
     assert (tmp_path / "front.png").stat().st_size > 10_000
     table = tradeoff.table_of([row], {row["point"]: "some"})
     assert "**some** mujoco 4" in report.markdown(table)
+
+
+def test_ways_to_search_are_fitted_into_the_same_time() -> None:
+    weights = stored.SHIPPED / f"{kick.WEIGHTS}.json"
+    row = optimizers.compare(kick.prepare(substeps=4), "Gauss-Newton, differences", weights, 0.3, targets=1, seed=0)
+    assert row["plan_seconds"] == pytest.approx(0.3, rel=0.5)
+    assert "Gauss-Newton, differences (GN" in report.markdown(optimizers.table_of([row], 0.3))
+    assert all(Point(Preset(*way, every=5)).name for way in optimizers.WAYS.values())

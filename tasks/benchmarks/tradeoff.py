@@ -154,8 +154,9 @@ def measure(kick: Kick, point: Point, weights: Path, targets: int, seed: int) ->
         target, shift = random_task(random)
         steps = kick.reference.strike + BEYOND + FLIGHT
         execution = kick.run(planners, target, seed + index, kick.start(shift), steps, stands=False)
-        spent = sum(replan.info.seconds for replan in kick.plans(execution))
-        kicks.append(kick.report(execution, target) | {"planning_seconds": spent})
+        plans = [replan.info for replan in kick.plans(execution)]
+        spent = sum(info.seconds for info in plans)
+        kicks.append(kick.report(execution, target) | {"planning_seconds": spent, "first_cost": plans[0].cost})
     jax.clear_caches()  # the next point's programs are others, and each holds its memory
     errors = np.array([each["truth_error_m"] for each in kicks])
     return {
@@ -164,6 +165,7 @@ def measure(kick: Kick, point: Point, weights: Path, targets: int, seed: int) ->
         "mean_truth_error_m": float(errors.mean()),
         "standard_error_m": float(errors.std(ddof=1) / np.sqrt(len(errors))) if len(errors) > 1 else None,
         "median_truth_error_m": float(np.median(errors)),
+        "first_cost": float(np.mean([each["first_cost"] for each in kicks])),
         "planning_seconds": float(np.mean([each["planning_seconds"] for each in kicks])),
         "plan_seconds": float(np.mean([each["plan_seconds"] for each in kicks])),
         "replan_ms": float(np.median([each["replan_ms"]["p50"] for each in kicks])),

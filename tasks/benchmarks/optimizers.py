@@ -1,0 +1,91 @@
+"""What gradients are worth: ways to search, alone and together, given the same time in the learned simulator."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+from rich.table import Table
+
+from larp_model import weights as stored
+from mpc import CEM, MPPI, GaussNewton, Gradient
+from tasks.benchmarks import report
+from tasks.benchmarks.kick import seconds_of
+from tasks.benchmarks.tradeoff import Point, measure
+from tasks.kick import WEIGHTS, Kick, models_of, prepare, remember_compilations, run
+from tasks.presets import Preset, Stage, within
+
+SAMPLING, SOME = CEM(samples=64, rounds=16, elites=12, decay=1.0), CEM(samples=32, rounds=4, elites=8, decay=1.0)
+FORWARD = GaussNewton(rounds=12, jacobian="forward")
+# By name: the first plan and each replan, before they are fitted into the time.
+WAYS: dict[str, tuple[Stage, Stage]] = {
+    "CEM": ((SAMPLING,), (CEM(samples=32, rounds=5, elites=12, decay=1.0),)),
+    "MPPI": ((MPPI(samples=64, rounds=16),), (MPPI(samples=32, rounds=5),)),
+    "RMSprop on reverse gradients": ((Gradient(steps=16, elites=8),), (Gradient(steps=4, elites=8),)),
+    "Gauss-Newton, differences": ((GaussNewton(rounds=12),), (GaussNewton(rounds=4),)),
+    "Gauss-Newton, forward derivatives": ((FORWARD,), (GaussNewton(rounds=4, jacobian="forward"),)),
+    "CEM, then Gauss-Newton, differences": ((SOME, GaussNewton(rounds=6)), (GaussNewton(rounds=4),)),
+}
+
+
+def compare(kick: Kick, name: str, weights: Path, seconds: float, targets: int, seed: int) -> report.Row:
+    """A way to search, its first plan fitted into `seconds` and each replan into a fifth of them."""
+    first, again = WAYS[name]
+    models = models_of(kick.scene, "larp", weights)
+    preset = within(Preset(first, again, every=5), seconds, partial(seconds_of, kick, models))
+    return measure(kick, Point(preset), weights, targets, seed) | {"way": name}
+
+
+def table_of(rows: list[report.Row], seconds: float) -> Table:
+    """A row a way."""
+    table = Table(
+        "search", "error, mean +- standard error", "median", "worst", "cost of the first plan", "first plan", "replan",
+        title=f"What gradients are worth, in {seconds:g} s",
+    )  # fmt: skip
+    for row in rows:
+        table.add_row(
+            f"{row['way']} ({row['point'].partition(': ')[2]})",
+            f"{row['mean_truth_error_m']:.3f} +- {row['standard_error_m'] or 0.0:.3f} m",
+            f"{row['median_truth_error_m']:.3f} m", f"{max(row['truth_errors_m']):.3f} m", f"{row['first_cost']:.3f}",
+            f"{row['plan_seconds']:.2f} s", f"{row['replan_ms']:.0f} ms",
+        )  # fmt: skip
+    return table
+
+
+def main(
+    seconds: float = 1.0,
+    targets: int = 32,
+    seed: int = 7,
+    json: Path = Path("runs/benchmarks/optimizers.json"),
+    weights: Path = stored.SHIPPED / f"{WEIGHTS}.json",
+    publish: bool = False,
+) -> None:
+    """Compare sampling, gradients, Gauss-Newton and both, each in the same time a plan, over the same kicks.
+
+    Args:
+        seconds: for a first plan; each replan has a fifth of them.
+        targets: kicks a way; the same for all.
+        seed: of targets, ball spots and planner.
+        json: where the figures go.
+        weights: manifest of the weights of the learned model.
+        publish: put the table into RESULTS.md.
+    """
+    if targets < 1:
+        raise ValueError(f"targets is {targets}, but must be at least 1")
+    report.ready(json, publish)
+    remember_compilations()
+    kick = prepare()
+    command = f"python -m tasks.benchmarks.optimizers --seconds {seconds:g} --targets {targets} --seed {seed}"
+    rows = report.collect(
+        json, command, {name: partial(compare, kick, name, weights, seconds, targets, seed) for name in WAYS}
+    )
+    report.write_json(json, {"command": command, "hardware": report.hardware(), "rows": rows})
+    table = table_of(rows, seconds)
+    report.show(table)
+    if publish:
+        title = f"What gradients are worth: {seconds:g} s a first plan, {targets} kicks"
+        report.publish("optimizers", title, command, table)
+
+
+if __name__ == "__main__":
+    run(main)
