@@ -19,7 +19,7 @@ from rich.table import Table
 
 from larp_model import weights as stored
 from larp_model.truth.mujoco import Truth
-from mpc import CEM, CostTerm, Gradient, Planner
+from mpc import CEM, MPPI, CostTerm, GaussNewton, Gradient, Planner
 from mpc.loop import Phase, Window, execute
 from tasks.benchmarks import pushes, report, slopes
 from tasks.benchmarks.pushes import Bench, refusal, row
@@ -78,7 +78,15 @@ def small_planners() -> list[Row]:
     lost = lambda plan, info: info.cost == np.inf and info.finite == 0 and not np.asarray(plan.knots).any()  # noqa: E731
     good = lambda plan, info: info.cost <= 0.0450001 and info.finite > 0  # noqa: E731
     better = "a finite plan that costs no more than none"
-    for name, optimizers in (("CEM", SMALL), ("Gradient", Gradient(elites=2)), ("both", (SMALL, Gradient(elites=2)))):
+    searches: tuple[tuple[str, Any], ...] = (
+        ("CEM", SMALL),
+        ("Gradient", Gradient(elites=2)),
+        ("both", (SMALL, Gradient(elites=2))),
+        ("MPPI", MPPI(samples=8, elites=2)),
+        ("Gauss-Newton, differences", GaussNewton(directions=6)),
+        ("Gauss-Newton, forward", GaussNewton(directions=6, jacobian="forward")),
+    )
+    for name, optimizers in searches:
         says(f"all candidates lost, {name}", nothing, toy(Shaky(-1.0), optimizers), lost)
         says(f"most candidates lost, {name}", better, toy(Shaky(0.05), optimizers), good)
     says("one candidate", better, toy(Shaky(np.inf), Gradient(steps=8, elites=1)), good)
@@ -86,10 +94,11 @@ def small_planners() -> list[Row]:
     says("horizon 2, the shortest", better, toy(Shaky(np.inf), horizon=2), good)
     says("horizon 2000", better, toy(Shaky(np.inf), horizon=2000), good)
     for steepness in (1e8, 1e15, 1e25):
-        steep = toy(Shaky(np.inf, steepness), Gradient(steps=2, elites=1))
-        promise = "finite knots; cost finite, or inf and 0 finite"
-        consistent = lambda plan, info: np.isfinite(info.cost) == (info.finite > 0)  # noqa: E731
-        says(f"a slope of {steepness:g} m/rad", promise, steep, consistent)
+        for name, optimizers in (("Gradient", Gradient(steps=2, elites=1)), searches[-1]):
+            steep = toy(Shaky(np.inf, steepness), optimizers)
+            promise = "finite knots; cost finite, or inf and 0 finite"
+            consistent = lambda plan, info: np.isfinite(info.cost) == (info.finite > 0)  # noqa: E731
+            says(f"a slope of {steepness:g} m/rad, {name}", promise, steep, consistent)
     wild = np.full((6, 1, 3), np.nan)
     says("reference of NaN", nothing, toy(Shaky(np.inf)), lost, reference=wild)
     says(
@@ -100,7 +109,8 @@ def small_planners() -> list[Row]:
         reference=np.full((6, 1, 3), np.inf),
     )
     locked = lambda plan, info: not np.asarray(plan.knots).any() and info.finite > 0  # noqa: E731
-    says("spread 0", "the reference itself", toy(Shaky(np.inf), spread=0.0), locked)
+    for name, optimizers in searches:
+        says(f"spread 0, {name}", "the reference itself", toy(Shaky(np.inf), optimizers, spread=0.0), locked)
 
     coarse = toy(Shaky(np.inf))
     target = jnp.full((6, 1, 3), 0.1234567, jnp.bfloat16)
