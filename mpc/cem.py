@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from mpc.search import Problem, Search, best_first, coloured_noise
+from mpc.search import COLOUR, Problem, Search, best_first, coloured_noise
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class CEM:
     """Share of the elites that are candidates again in the next round, and in the next plan."""
     momentum: float = 0.1
     """Share of the old mean and spread in the new."""
-    exponent: float = 2.0
+    exponent: float = COLOUR
     """Colour of the noise; 0 is white."""
     floor: float = 0.05
     """Least spread, as a share of the first plan's."""

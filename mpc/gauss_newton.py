@@ -6,12 +6,13 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from mpc.search import Problem, Residuals, Search, Tried, coloured_noise, merged
+from mpc.search import COLOUR, Problem, Residuals, Search, Tried, coloured_noise, merged
 
 # Dampings of a round, tried side by side, as multiples of the last one that served best.
 FACTORS = np.array([1e-2, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0, 1000.0])
-# A step that gains more, or less, of what its quadratic promises divides, or multiplies, the next damping.
-GOOD, BAD, CHANGE = 0.75, 0.25, 3.0
+# A step that gains more, or less, of what its quadratic promises divides, or multiplies, the next damping, down to a
+# floor; where no step gains anything it is ten times as large.
+GOOD, BAD, CHANGE, FAILED, FLOOR = 0.75, 0.25, 3.0, 10.0, 1e-6
 # No step is longer, in spreads (root mean square over the knots).
 LONGEST = 3.0
 
@@ -46,7 +47,7 @@ class GaussNewton:
     """Of the differences, in spreads."""
     damping: float = 1e-2
     """At first, as a share of the curvature's mean over the directions."""
-    exponent: float = 2.0
+    exponent: float = COLOUR
     """Colour of the directions; 0 is white."""
     elites: int = 1
     """Candidates that are refined, one after the other."""
@@ -77,10 +78,15 @@ class GaussNewton:
         here, damping = problem.tries(knots[None]), self.damping
         search = merged(search, knots[None], here.costs)
         for _ in range(self.rounds):
-            if not np.isfinite(here.costs[0]):
-                break
             noise = coloured_noise(random, (self.directions, *knots.shape), self.exponent)
             directions = search.spread * noise
+            if not np.isfinite(here.costs[0]):  # no slope where nothing comes back: look around
+                tried = problem.tries(knots + directions)
+                search = merged(search, knots + directions, tried.costs)
+                best = int(np.argmin(tried.costs))
+                if np.isfinite(tried.costs[best]):
+                    knots, here = knots + directions[best], tried.row(best)
+                continue
             search, derivatives = self.derivatives(knots, here, directions, search, problem)
             slopes = quadratic(here, derivatives)
             steps, coordinates, dampings = self.steps(slopes, damping, directions, search.scale)
@@ -93,13 +99,13 @@ class GaussNewton:
             a = coordinates[best]
             promised = float(-slopes.gradient @ a - 0.5 * a @ slopes.curvature @ a)
             if not gained > 0.0:
-                damping *= CHANGE
+                damping *= FAILED
                 continue
             damping = dampings[best]
             if gained < BAD * promised:
                 damping *= CHANGE
             elif gained > GOOD * promised:
-                damping /= CHANGE
+                damping = max(damping / CHANGE, FLOOR)
             knots = knots + steps[best]
             here = tried.row(best)
         return search
@@ -111,6 +117,7 @@ class GaussNewton:
 
         What differences try may become an elite.
         """
+        usable = np.ones(len(directions), bool)
         if self.jacobian == "forward":
             found = problem.tangents(knots, directions)
         else:
@@ -118,7 +125,8 @@ class GaussNewton:
             there = problem.tries(beside)
             search = merged(search, beside, there.costs)
             found = {name: (each - here.residuals[name]) / self.step for name, each in there.residuals.items()}
-        usable = np.all([np.isfinite(_flat(each)).all(axis=1) for each in found.values()], axis=0)
+            usable = np.isfinite(there.costs)  # the residuals of what is lost may be anything
+        usable &= np.all([np.isfinite(_flat(each)).all(axis=1) for each in found.values()], axis=0)
         if self.jacobian == "forward":
             problem.lost(int((~usable).sum()))
         return search, {name: np.where(usable.reshape(-1, *(1,) * (r.ndim - 1)), r, 0.0) for name, r in found.items()}

@@ -45,8 +45,8 @@ def never(step: int, state: np.ndarray) -> bool:
 class Phase(NamedTuple):
     """A part of an execution: who plans in it, and for what.
 
-    first: the planner of its first plan; again: of all later ones, every `every` steps. Both share horizon, knots and
-    elites. window: what is wanted from a step on. over: whether, in a step with a state (L, 13), the phase comes to its
+    first: the planner of its first plan; again: of all later ones, every `every` steps. Both share horizon and knots.
+    window: what is wanted from a step on. over: whether, in a step with a state (L, 13), the phase comes to its
     end: for `linger` steps its plan is carried on, then the next phase begins or, after the last, planning ends. links:
     those that the planners' dynamics know.
     """

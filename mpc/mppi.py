@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from mpc.search import Problem, Search, coloured_noise, merged
+from mpc.search import COLOUR, Problem, Search, coloured_noise, merged
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class MPPI:
     rounds: int = 4
     temperature: float = 0.1
     """In units of the standard deviation of a round's finite costs."""
-    exponent: float = 2.0
+    exponent: float = COLOUR
     """Colour of the noise; 0 is white."""
     elites: int = 8
     """Of the best candidates, so many are kept."""
@@ -51,6 +51,8 @@ class MPPI:
         finite = np.isfinite(costs)
         if not finite.any():
             return search
-        unit = self.temperature * max(float(costs[finite].std()), 1e-12)
-        weight = np.exp((costs[finite].min() - costs) / unit)  # of an infinite cost 0
-        return search._replace(mean=np.einsum("n,nkjd->kjd", weight / weight.sum(), candidates))
+        value = costs[finite].astype(float)
+        unit = self.temperature * max(value.std(), 1e-12)
+        weight = np.exp((value.min() - value) / unit)
+        share = (weight / weight.sum()).astype(np.float32)
+        return search._replace(mean=np.einsum("n,nkjd->kjd", share, candidates[finite]))

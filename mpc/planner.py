@@ -13,10 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from mpc.cem import CEM
 from mpc.cost import CostTerm, curvatures, evaluate, require_weight, residuals, weighed
 from mpc.dynamics import Dynamics
-from mpc.search import Optimizer, Residuals, Search, Tried, coloured_noise
+from mpc.search import COLOUR, Optimizer, Residuals, Search, Tried, coloured_noise
 from mpc.spline import Interpolation, interpolate, shift
 
 # Every size is compiled apart, a kick's for 8 s. So candidates are rolled out so many at a time, where there are few of
@@ -123,13 +122,16 @@ class Planner:
             if each.differentiates and not self.dynamics.differentiable:
                 names = type(each).__name__, type(self.dynamics).__name__
                 raise ValueError("optimizers: got {}, needs differentiable dynamics, not {}".format(*names))
+        for each in self.optimizers[:-1]:
+            if getattr(each, "settles", False):
+                raise ValueError(f"optimizers: got {type(each).__name__} before another, needs it last")
         self.elites = max(optimizer.elites for optimizer in self.optimizers)
 
     def init(self, key: jax.Array, now: float = 0.0) -> Plan:
         """The plan that follows the reference from `now` [s]; its other elites are drawn around it."""
         random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
         spread = np.broadcast_to(self.scale, (len(self.knot_times), *self.scale.shape))
-        elites = coloured_noise(random, (self.elites, *spread.shape), CEM.exponent) * spread
+        elites = coloured_noise(random, (self.elites, *spread.shape), COLOUR) * spread
         elites[0] = 0.0
         return Plan(elites, spread, np.float32(now), _entropy(random))
 
@@ -153,10 +155,13 @@ class Planner:
         wanted = self._wanted(plan, state, reference, context, weights, now, steps)
         begin, compiled = time.perf_counter(), self._programs.seconds
         random = np.random.default_rng(plan.key)
-        search = self._shifted(plan, now - float(plan.start))
+        search = self._shifted(plan, now - float(plan.start), random)
         problem = PlannerProblem(self, wanted, search.elites[0])
         for optimizer in self.optimizers:
             search = optimizer.improve(search, random, problem)
+            if len(search.elites) != self.elites:
+                name = type(optimizer).__name__
+                raise ValueError(f"optimizers: got {len(search.elites)} elites from {name}, needs {self.elites}")
         known = np.isfinite(search.costs)[:, None, None, None]
         after = Plan(np.where(known, search.elites, search.elites[0]), search.spread, np.float32(now), _entropy(random))
         states = problem.states_of(after.knots)
@@ -184,7 +189,7 @@ class Planner:
         weights: Mapping[str, float] | None = None,
         steps: int | None = None,
     ) -> float:
-        """Compiles ahead what a plan with arguments of these shapes needs, by planning once; returns the seconds."""
+        """Compiles ahead what a first plan with arguments of these shapes uses, by making it; returns the seconds."""
         _, info = self.step(self.init(jax.random.key(0)), state, reference, context, weights, 0.0, steps)
         return info.compile_seconds
 
@@ -203,14 +208,14 @@ class Planner:
     def _weigh(
         self, wanted: Wanted, states: jax.Array, controls: jax.Array, corrections: Any
     ) -> tuple[jax.Array, Any, Any]:
-        """Costs, residuals and their curvatures of N candidates, the residuals moved by corrections (N, ...)."""
+        """Costs, residuals and their curvatures of N candidates, the residuals moved by corrections."""
 
-        def one(states: jax.Array, controls: jax.Array, moved: Any) -> tuple[jax.Array, Any, Any]:
-            found = residuals(self.terms, states, controls, wanted.context, moved)
+        def one(states: jax.Array, controls: jax.Array) -> tuple[jax.Array, Any, Any]:
+            found = residuals(self.terms, states, controls, wanted.context, corrections)
             cost, _ = weighed(self.terms, found, states, wanted.weights)
             return cost, found, curvatures(self.terms, found, wanted.weights)
 
-        return jax.vmap(one)(states, controls, corrections)
+        return jax.vmap(one)(states, controls)
 
     def _gradients(self, wanted: Wanted, knots: jax.Array, corrections: Any) -> tuple[jax.Array, Any, jax.Array]:
         def summed(knots: jax.Array) -> tuple[jax.Array, Any]:
@@ -247,11 +252,17 @@ class Planner:
     def _run(self, name: Any, function: Callable[..., Any], *arguments: Any) -> Any:
         return jax.block_until_ready(self._programs(name, function, *arguments))
 
-    def _shifted(self, plan: Plan, elapsed: float) -> Search:
-        """The last plan's search as it looks `elapsed` [s] later, its spread widened, its costs unknown."""
-        rows = np.minimum(np.arange(self.elites), len(plan.elites) - 1)  # the last planner may have kept more, or fewer
-        given = plan.elites[rows], plan.spread, np.float32(elapsed)
-        elites, spread = map(np.asarray, self._run("shift", self._shift, *given))
+    def _shifted(self, plan: Plan, elapsed: float, random: np.random.Generator) -> Search:
+        """The last plan's search as it looks `elapsed` [s] later, its spread widened, its costs unknown.
+
+        Where the last planner kept fewer elites, the others are drawn around its plan.
+        """
+        elites = plan.elites[: self.elites]
+        missing = self.elites - len(elites)
+        if missing:
+            drawn = plan.spread * coloured_noise(random, (missing, *plan.knots.shape), COLOUR)
+            elites = np.concatenate([elites, plan.knots + drawn])
+        elites, spread = map(np.asarray, self._run("shift", self._shift, elites, plan.spread, np.float32(elapsed)))
         spread = spread + self.reheat * np.maximum(self.scale - spread, 0.0)
         return Search(elites[0], spread, elites, np.full(self.elites, np.inf, np.float32), self.scale)
 
@@ -353,35 +364,25 @@ class PlannerProblem:
     planner: Planner
     wanted: Wanted
     carried: np.ndarray
-    correction: Callable[[np.ndarray], Residuals] | None = None
+    corrections: Residuals = field(default_factory=dict)
     record: Record = field(default_factory=Record)
-
-    @property
-    def differentiable(self) -> bool:
-        """See `search.Problem`."""
-        return self.planner.dynamics.differentiable
 
     def tries(self, knots: np.ndarray) -> Tried:
         """See `search.Problem`."""
         few = len(knots) <= (FEW if jax.default_backend() == "cpu" else SIDE_BY_SIDE)
-        size = SIDE_BY_SIDE if few else len(knots)
-        return self._tries(self.planner.dynamics, knots, self._corrections(knots), size)
+        return self._tries(self.planner.dynamics, knots, SIDE_BY_SIDE if few else len(knots))
 
     def gradients(self, knots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """See `search.Problem`."""
         gradient, tried, states = self.planner._run(
-            "gradients", self.planner._gradients, self.wanted, knots, self._corrections(knots)
+            "gradients", self.planner._gradients, self.wanted, knots, self.corrections
         )
         return self._recorded(knots, tried, states).costs, np.asarray(gradient)
 
     def tangents(self, knots: np.ndarray, directions: np.ndarray) -> Residuals:
         """See `search.Problem`."""
         found = self.planner._run("tangents", self.planner._tangents, self.wanted, knots, directions)
-        found = {name: np.asarray(each) for name, each in found.items()}
-        if self.correction is not None:
-            here, there = self.correction(knots[None]), self.correction(knots + directions)
-            found = {name: each + there[name] - here[name] for name, each in found.items()}
-        return found
+        return {name: np.asarray(each) for name, each in found.items()}
 
     def lost(self, count: int) -> None:
         """See `search.Problem`."""
@@ -391,11 +392,12 @@ class PlannerProblem:
     def trials(self, dynamics: Dynamics, knots: np.ndarray) -> Tried:
         """See `search.Problem`."""
         self.record.verified += len(knots)
-        return replace(self, record=Record(self.record.costs))._tries(dynamics, knots, {}, len(knots))
+        apart = replace(self, corrections={}, record=Record(self.record.costs))
+        return apart._tries(dynamics, knots, len(knots))
 
-    def corrected(self, correction: Callable[[np.ndarray], Residuals]) -> PlannerProblem:
+    def corrected(self, corrections: Residuals) -> PlannerProblem:
         """See `search.Problem`."""
-        return replace(self, correction=correction)
+        return replace(self, corrections={name: each[0] for name, each in corrections.items()})
 
     def states_of(self, knots: np.ndarray) -> np.ndarray:
         """What the dynamics make of knots (K, J, 3): states (H', L, 13)."""
@@ -403,17 +405,14 @@ class PlannerProblem:
             self.tries(knots[None])
         return self.record.best[knots.tobytes()]
 
-    def _corrections(self, knots: np.ndarray) -> Residuals:
-        return {} if self.correction is None else self.correction(knots)
-
-    def _tries(self, dynamics: Dynamics, knots: np.ndarray, corrections: Residuals, size: int) -> Tried:
+    def _tries(self, dynamics: Dynamics, knots: np.ndarray, size: int) -> Tried:
         """`size` candidates at a time, the last ones filled up."""
         planner, name, found = self.planner, ("roll out", id(dynamics)), []
         for begin in range(0, len(knots), size):
             rows = np.minimum(np.arange(begin, begin + size), len(knots) - 1)
-            some, moved = jax.tree.map(lambda each, rows=rows: each[rows], (knots, corrections))
-            states, controls = planner._run(name, partial(planner._roll_out, dynamics), self.wanted, some)
-            found.append((planner._run("weigh", planner._weigh, self.wanted, states, controls, moved), states))
+            states, controls = planner._run(name, partial(planner._roll_out, dynamics), self.wanted, knots[rows])
+            weighed = planner._run("weigh", planner._weigh, self.wanted, states, controls, self.corrections)
+            found.append((weighed, states))
         if len(knots) == size:
             return self._recorded(knots, *found[0])
         tried, states = jax.tree.map(lambda *parts: np.concatenate(parts)[: len(knots)], *found)

@@ -7,7 +7,6 @@ optimisers and planners of a problem share.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -45,10 +44,6 @@ class Tried(NamedTuple):
 class Problem(Protocol):
     """What an optimiser may ask. Every cost that is found is counted by the planner."""
 
-    @property
-    def differentiable(self) -> bool:
-        """Whether the planner's dynamics have gradients."""
-
     def tries(self, knots: np.ndarray) -> Tried:
         """Knots (N, K, J, 3) [rad], rolled out in the planner's own dynamics."""
 
@@ -68,12 +63,15 @@ class Problem(Protocol):
     def trials(self, dynamics: Any, knots: np.ndarray) -> Tried:
         """`tries` in other dynamics, without corrections; counted apart."""
 
-    def corrected(self, correction: Callable[[np.ndarray], Residuals]) -> Problem:
-        """The same problem with something added to the residuals: `correction` of knots (N, K, J, 3), (N, ...)."""
+    def corrected(self, corrections: Residuals) -> Problem:
+        """The same problem with something added to the residuals of every candidate, (1, ...) by term."""
 
 
 class Optimizer(Protocol):
-    """A way to better candidates: whatever is given, what comes out is no worse. Its fields are its settings."""
+    """A way to better candidates: whatever is given, what comes out is no worse. Its fields are its settings.
+
+    One that ranks by other dynamics than the planner's own says so (`settles = True`), and comes last.
+    """
 
     @property
     def differentiates(self) -> bool:
@@ -84,7 +82,7 @@ class Optimizer(Protocol):
         """How many of the best candidates it needs."""
 
     def improve(self, search: Search, random: np.random.Generator, problem: Problem) -> Search:
-        """The search after all rounds, its elites ranked by what they cost."""
+        """The search after all rounds, with as many elites as before, ranked by what they cost."""
 
 
 def best_first(knots: np.ndarray, costs: np.ndarray, count: int | None) -> tuple[np.ndarray, np.ndarray]:
@@ -93,14 +91,25 @@ def best_first(knots: np.ndarray, costs: np.ndarray, count: int | None) -> tuple
     return knots[order], costs[order]
 
 
+def distinct(knots: np.ndarray) -> np.ndarray:
+    """Rows of knots (N, K, J, 3) that are not copies of an earlier one, in their order."""
+    first: dict[bytes, int] = {}
+    for row, each in enumerate(knots):
+        first.setdefault(each.tobytes(), row)
+    return np.array(list(first.values()), int)
+
+
 def merged(search: Search, knots: np.ndarray, costs: np.ndarray) -> Search:
-    """The search with new candidates (N, K, J, 3) of known costs (N,) among its elites, each once while they last."""
-    count = len(search.elites)
+    """The search with new candidates (N, K, J, 3) of known costs (N,) among its elites, copies last and unknown."""
     both, known = best_first(np.concatenate([search.elites, knots]), np.concatenate([search.costs, costs]), None)
-    _, first = np.unique(both.reshape(len(both), -1), axis=0, return_index=True)
-    again = np.setdiff1d(np.arange(len(both)), first)
-    order = np.concatenate([np.sort(first), again])[:count]
-    return search._replace(elites=both[order], costs=np.where(np.isin(order, again), np.inf, known[order]))
+    once = distinct(both)
+    copies = np.setdiff1d(np.arange(len(both)), once)
+    order = np.concatenate([once, copies])[: len(search.elites)]
+    return search._replace(elites=both[order], costs=np.where(np.isin(order, copies), np.inf, known[order]))
+
+
+# Colour of the noise where an optimiser does not say it.
+COLOUR = 2.0
 
 
 def coloured_noise(random: np.random.Generator, shape: tuple[int, ...], exponent: float) -> np.ndarray:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from mpc.dynamics import Dynamics
-from mpc.search import Optimizer, Problem, Residuals, Search
+from mpc.search import Optimizer, Problem, Residuals, Search, distinct
 
 
 class Trial(NamedTuple):
@@ -35,6 +34,8 @@ class Verified:
     one candidate suffices (model management: N. Alexandrov and R. Lewis, "An Overview of First-Order Model Management
     for Engineering Optimization", 2001).
     """
+
+    settles: ClassVar[bool] = True
 
     dynamics: Dynamics
     optimizer: Optimizer
@@ -64,7 +65,7 @@ class Verified:
         return max(self.candidates, self.optimizer.elites)
 
     def improve(self, search: Search, random: np.random.Generator, problem: Problem) -> Search:
-        """All rounds, until one candidate's residuals are `enough`; the elites are ranked by the truer dynamics."""
+        """All rounds, until the cheapest trial is `enough`; the elites are ranked by the truer dynamics."""
         tried: list[Trial] = []
         proposed = np.concatenate([search.elites[:1], problem.carried[None], search.elites[1:]])
         for index in range(self.rounds):
@@ -80,7 +81,7 @@ class Verified:
             if index and not any(best is trial for trial in tried[-len(knots) :]) and np.isfinite(best.cost):
                 proposed = 0.5 * (best.knots + knots)
                 continue
-            inner = problem.corrected(self.correction(best, problem)) if np.isfinite(best.cost) else problem
+            inner = self.corrected(best, problem)
             elites = np.concatenate([best.knots[None], search.elites[:-1]])
             search = search._replace(mean=best.knots, elites=elites, costs=np.full(len(elites), np.inf, np.float32))
             search = self.optimizer.improve(search, random, inner)
@@ -95,19 +96,20 @@ class Verified:
         return bool(lengths) and np.isfinite(trial.cost) and all(lengths)
 
     @staticmethod
-    def correction(best: Trial, problem: Problem) -> Callable[[np.ndarray], Residuals]:
-        """What to add to the residuals of the planner's own dynamics so that they are right for the best candidate."""
-        believed = problem.tries(best.knots[None]).residuals
-        apart = {name: true - believed[name] for name, true in best.residuals.items()}
-        return lambda knots: {name: np.repeat(each, len(knots), axis=0) for name, each in apart.items()}
+    def corrected(best: Trial, problem: Problem) -> Problem:
+        """The problem whose residuals are right for the best candidate; as it is where the planner's own are lost."""
+        if not np.isfinite(best.cost):
+            return problem
+        believed = problem.tries(best.knots[None])
+        if not np.isfinite(believed.costs[0]):
+            return problem
+        return problem.corrected({name: true - believed.residuals[name] for name, true in best.residuals.items()})
 
 
 def untried(knots: np.ndarray, tried: list[Trial]) -> np.ndarray:
     """Those of knots (N, K, J, 3) that were not tried yet, in their order, each once."""
-    fresh = {each.tobytes(): each for each in reversed(knots)}  # the first of equals, for the last one written stays
-    for trial in tried:
-        fresh.pop(trial.knots.tobytes(), None)
-    return np.stack(list(reversed(fresh.values()))) if fresh else knots[:0]
+    known = {trial.knots.tobytes() for trial in tried}
+    return knots[[row for row in distinct(knots) if knots[row].tobytes() not in known]]
 
 
 def led_by(tried: list[Trial], search: Search) -> Search:

@@ -53,7 +53,7 @@ from mpc.loop import Execution, Phase, Replan, Window, execute
 from tasks import references, residuals
 from tasks.data import stray
 from tasks.gap import contact_step, gap, told
-from tasks.presets import Preset, preset_of
+from tasks.presets import Preset, preset_of, usable
 from tasks.references import Reference
 from tasks.standing import Standing
 from viewer import LivePage, Recording, kick_picture, nearest_approach, write_html
@@ -279,11 +279,6 @@ class Kick:
         free = self.untouched(start, len(controls))[:, packed.VELOCITY]
         begin, end = after_contact(contact_step(states, free), len(states))
         return miss(states[begin:end, self.ball, packed.POSITION], target)
-
-
-def usable(dynamics: Dynamics, optimizers: tuple[Optimizer, ...]) -> list[Optimizer]:
-    """Those of the optimisers that these dynamics serve."""
-    return [each for each in optimizers if dynamics.differentiable or not each.differentiates]
 
 
 def after_contact(contact: int | None, count: int) -> tuple[int, int]:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from mpc import CEM, MPPI, GaussNewton, Gradient, Optimizer
+from mpc import CEM, MPPI, Dynamics, GaussNewton, Gradient, Optimizer
 
 # Time of a replan, as a share of the first plan's, where a budget is given.
 AGAIN = 0.2
@@ -38,12 +38,17 @@ class Preset:
     stand: Stage = (STAND,)
 
 
-# Points of `tasks.benchmarks.tradeoff`. Of one number of directions, because every number is compiled apart.
+# Points of `tasks.benchmarks.tradeoff`.
 PRESETS = {
     "fast": Preset((GaussNewton(rounds=6),), (GaussNewton(rounds=1),), every=5),
     "balanced": Preset((GaussNewton(rounds=12),), (GaussNewton(rounds=1),), every=1),
     "accurate": Preset((GaussNewton(rounds=12),), (GaussNewton(rounds=1),), every=5, verify=(8, 3)),
 }
+
+
+def usable(dynamics: Dynamics, optimizers: Stage) -> Stage:
+    """Those of the optimisers that these dynamics serve."""
+    return tuple(each for each in optimizers if dynamics.differentiable or not each.differentiates)
 
 
 def preset_of(name: str) -> Preset:
@@ -109,7 +114,7 @@ def fitted(optimizer: Optimizer, factor: float) -> Optimizer:
             return replace(optimizer, samples=samples, rounds=rounds, elites=elites)
         case GaussNewton():
             rounds = max(1, round(factor * optimizer.rounds))
-            share = min(1.0, factor * optimizer.rounds / rounds)
+            share = min(1.0, factor * optimizer.rounds)
             return replace(optimizer, rounds=rounds, directions=max(LEAST, round(share * optimizer.directions)))
         case Gradient():
             return replace(optimizer, steps=max(1, round(factor * optimizer.steps)))

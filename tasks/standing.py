@@ -24,6 +24,7 @@ from mpc import CostTerm, Dynamics, Optimizer, Planner, quadratic
 from mpc.loop import Window
 from tasks import residuals
 from tasks.data import stray
+from tasks.presets import usable
 from tasks.references import Reference
 
 HORIZON = 50
@@ -80,7 +81,6 @@ class Standing:
 
     def planner(self, dynamics: Dynamics, optimizers: tuple[Optimizer, ...]) -> Planner:
         """A planner of this task on dynamics of the human alone."""
-        usable = [each for each in optimizers if dynamics.differentiable or not each.differentiates]
         bounds = np.array([(motor.lower, motor.upper) for motor in self.scene.motors])
         return Planner(
             dynamics,
@@ -89,7 +89,7 @@ class Standing:
             KNOTS,
             self.scene.dt,
             SEARCH * stray(self.scene),
-            usable,
+            usable(dynamics, optimizers),
             bounds[:, 0],
             bounds[:, 1],
         )

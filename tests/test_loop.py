@@ -149,6 +149,25 @@ def test_where_no_trial_is_finite_the_last_plan_stays() -> None:
     assert info.finite < info.candidates
 
 
+def test_what_is_verified_comes_last() -> None:
+    with pytest.raises(ValueError, match="optimizers: got Verified before another"):
+        _planner(Mover(), (Verified(Mover(50.0), SEARCH), SEARCH))
+
+
+def test_the_plan_carried_on_is_tried_even_where_it_is_a_late_elite() -> None:
+    asked = []
+
+    class Asked(Mover):
+        def rollout(self, state: jax.Array, controls: jax.Array, steps: jax.Array | None = None) -> jax.Array:
+            jax.debug.callback(lambda each: asked.append(np.asarray(each)), controls)
+            return super().rollout(state, controls, steps)
+
+    late = CEM(samples=24, rounds=1, elites=12, keep=0.9)
+    planner = _planner(Mover(85.0), (late, Verified(Asked(100.0), late, rounds=1, candidates=2)))
+    planner.step(planner.init(jax.random.key(1)), START, np.zeros((HORIZON, 1, 3)), TARGET)
+    assert any((each == 0.0).all(axis=(1, 2, 3)).any() for each in asked)
+
+
 def test_a_step_by_the_truths_residual_and_the_models_slope_needs_few_trials() -> None:
     model, truth = Mover(85.0), Mover(100.0)
     step = GaussNewton(rounds=1, directions=12, damping=1e-6)

@@ -28,7 +28,7 @@ from mpc import (
     shift,
 )
 from mpc.cost import curvatures
-from mpc.search import Search, Tried, coloured_noise
+from mpc.search import Search, Tried, coloured_noise, distinct, merged
 
 HORIZON, KNOTS, DT = 12, 4, 0.01
 KINDS = ("linear", "cubic")
@@ -395,6 +395,12 @@ def test_the_parabola_of_a_term_touches_its_cost_with_its_slope(norm: Any, resid
     np.testing.assert_allclose(curvature * at, slope, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.parametrize(("norm", "expected"), [(quadratic, 2.0), (l2(0.1), 20.0), (absolute(0.1), 20.0)])
+def test_where_a_residual_vanishes_its_parabola_is_as_steep_as_its_norm(norm: Any, expected: float) -> None:
+    term = CostTerm("term", _miss, norm, 2.0)
+    np.testing.assert_allclose(curvatures((term,), {"term": jnp.zeros(3)})["term"], expected, rtol=1e-3)
+
+
 # Optimisers
 
 
@@ -402,7 +408,6 @@ def test_the_parabola_of_a_term_touches_its_cost_with_its_slope(norm: Any, resid
 class Ripples:
     """A bowl with ripples around 0.3; nothing below -1 is finite. Optimisers see it as a `Problem`."""
 
-    differentiable = True
     counted: int = 0
     missing: int = 0
 
@@ -502,6 +507,48 @@ class Torn:
         return PointMass().rollout(state, controls + jnp.sqrt(0.0 * controls))
 
 
+def test_differences_take_nothing_from_candidates_that_are_lost() -> None:
+    class Treacherous(Ripples):
+        def tries(self, knots: np.ndarray) -> Tried:
+            return Tried(np.array([0.5, np.inf], np.float32), {"miss": np.array([[0.9], [0.0]])}, {})
+
+    here = Tried(np.array([0.6]), {"miss": np.array([[1.0]])}, {})
+    search = _search()
+    directions = np.ones((2, KNOTS, 1, 3), np.float32)
+    newton = GaussNewton(directions=2, step=0.1)
+    _, found = newton.derivatives(search.mean, here, directions, search, Treacherous())  # type: ignore[arg-type]
+    np.testing.assert_allclose(found["miss"], [[-1.0], [0.0]])
+
+
+@dataclass(frozen=True)
+class Away:
+    """A point mass that is lost where its targets stay below 10 mrad."""
+
+    differentiable = True
+
+    def rollout(self, state: jax.Array, controls: jax.Array, steps: jax.Array | None = None) -> jax.Array:
+        lost = jnp.max(controls[:, :, 0, 0], axis=1) < 0.01
+        return jnp.where(lost[:, None, None, None], jnp.nan, PointMass().rollout(state, controls))
+
+
+def test_gauss_newton_looks_around_where_nothing_comes_back() -> None:
+    planner = _planner(Away(), GaussNewton(rounds=4, directions=8))
+    _, info = planner.step(planner.init(jax.random.key(0)), STATE, REFERENCE, TARGET)
+    assert not np.isfinite(info.costs[0]).any()
+    assert info.cost < 0.01
+
+
+def test_mppi_weighs_huge_and_lost_costs_without_losing_its_mean() -> None:
+    search, candidates = _search(), np.random.default_rng(0).normal(size=(4, KNOTS, 1, 3)).astype(np.float32)
+    costs = np.array([1.0, 1e30, np.inf, np.nan], np.float32)
+    np.testing.assert_allclose(MPPI().update(search, candidates, costs).mean, candidates[0], rtol=1e-5)
+
+
+def test_of_copies_the_first_stays_in_its_place() -> None:
+    a, b, c = np.arange(3, dtype=np.float32).reshape(3, 1, 1, 1)
+    np.testing.assert_array_equal(distinct(np.stack([a, b, a, c, b, a])), [0, 1, 3])
+
+
 def test_derivatives_that_are_not_finite_leave_the_plan_and_are_counted() -> None:
     _, plan, info = _line(Torn(), rounds=2, directions=5, jacobian="forward")
     assert not plan.knots.any() and np.isfinite(info.cost)
@@ -512,7 +559,7 @@ def test_planners_of_one_problem_share_what_is_compiled() -> None:
     first = _planner(optimizers=CEM(samples=16, rounds=2, elites=3, decay=1.0))
     plan, info = first.step(first.init(jax.random.key(0)), STATE, REFERENCE, TARGET)
     again = first.using((MPPI(samples=16, rounds=3, elites=3), GaussNewton(directions=16, elites=3)))
-    first.using(MPPI(samples=2, rounds=1)).compile(STATE, REFERENCE, TARGET)  # few: one size
+    assert first.using(MPPI(samples=2, rounds=1, elites=3)).compile(STATE, REFERENCE, TARGET) == 0  # few: one size
     _, second = again.step(plan, STATE, REFERENCE, TARGET)
     assert info.compile_seconds > 0 and second.compile_seconds == 0
     assert second.cost <= info.cost
@@ -538,8 +585,7 @@ class Nudge:
         knots = np.repeat(search.elites[:1], 4, axis=0)
         knots[1:, 0, 0] += 0.1 * np.eye(3, dtype=np.float32)
         costs = problem.tries(knots).costs
-        best = int(np.argmin(costs))
-        return search._replace(elites=knots[best : best + 1], costs=costs[best : best + 1])
+        return merged(search, knots, costs)
 
 
 def test_the_planner_takes_anyones_own_optimiser() -> None:
