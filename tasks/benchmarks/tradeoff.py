@@ -25,7 +25,7 @@ from tasks.presets import PRESETS, Preset
 BETTER = 0.1
 FAMILIES = {
     "sampling": ("LARP, sampling", "o", "#0072b2"),
-    "gradient": ("LARP, with gradients", "s", "#009e73"),
+    "gradient": ("LARP, Gauss-Newton or gradients", "s", "#009e73"),
     "verified": ("LARP, verified in MuJoCo", "D", "#d55e00"),
     "mujoco": ("MuJoCo as the model", "^", "#7f7f7f"),
 }
