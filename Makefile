@@ -45,14 +45,14 @@ KICK := $(RUN) tasks.benchmarks.kick --seed 7 --publish
 bench: $(READY)
 	$(RUN) tasks.benchmarks.speed --publish
 	$(RUN) tasks.benchmarks.tradeoff --publish
+	$(RUN) tasks.benchmarks.optimizers --publish
 	$(RUN) tasks.benchmarks.stability --publish
 	$(RUN) tasks.benchmarks.model --scene human_ball --sequences 256 --seed 1 --publish
 	$(RUN) tasks.benchmarks.gap --targets 8 --seed 7 --publish
-	for preset in fast balanced accurate; do $(KICK) --targets 32 --preset $$preset || exit; done
+	for preset in fast balanced accurate; do $(RUN) tasks.benchmarks.kick --publish --targets 64 --seed 11 --preset $$preset || exit; done
 	for preset in fast balanced accurate; do $(KICK) --targets 32 --preset $$preset --substeps 20 || exit; done
-	for seconds in 1 5; do $(KICK) --preset balanced --dynamics mujoco --budget $$seconds || exit; done
-	$(KICK) --preset balanced --budget 1
-	$(KICK) --preset accurate --budget 5
+	for model in larp mujoco; do $(KICK) --targets 32 --preset balanced --budget 1 --dynamics $$model || exit; done
+	for model in larp mujoco; do $(KICK) --targets 32 --preset accurate --budget 5 --dynamics $$model || exit; done
 	$(KICK) --targets 8 --preset accurate --noise
 	$(KICK) --targets 32 --noise
 	$(KICK) --targets 32 --rolling 2
