@@ -40,7 +40,7 @@ class Preset:
 
 # Points of `tasks.benchmarks.tradeoff`.
 PRESETS = {
-    "fast": Preset((GaussNewton(rounds=6),), (GaussNewton(rounds=1),), every=5),
+    "fast": Preset((GaussNewton(rounds=4),), (GaussNewton(rounds=1),), every=5),
     "balanced": Preset((GaussNewton(rounds=6),), (CEM(samples=16, rounds=5, elites=8, decay=1.0),), every=5),
     "accurate": Preset((GaussNewton(rounds=12),), (GaussNewton(rounds=1),), every=5, verify=(8, 3)),
 }
