@@ -38,10 +38,11 @@ class Preset:
     stand: Stage = (STAND,)
 
 
-# Points of `tasks.benchmarks.tradeoff`.
+# Points of `tasks.benchmarks.tradeoff`. Over its 16 kicks a little sampling in the replans of `balanced` missed by less,
+# over 64 others by a quarter more.
 PRESETS = {
     "fast": Preset((GaussNewton(rounds=4),), (GaussNewton(rounds=1),), every=5),
-    "balanced": Preset((GaussNewton(rounds=6),), (CEM(samples=16, rounds=5, elites=8, decay=1.0),), every=5),
+    "balanced": Preset((GaussNewton(rounds=12),), (GaussNewton(rounds=1),), every=1),
     "accurate": Preset((GaussNewton(rounds=12),), (GaussNewton(rounds=1),), every=5, verify=(8, 3)),
 }
 

@@ -124,7 +124,6 @@ def _around() -> Iterator[Point]:
     # More replans, and what they do.
     for every in (1, 2, 3, 8, 12):
         yield larp(newton(rounds=6), every=every)
-    yield larp(newton(rounds=12), every=1)
     for again in (twice, newton(rounds=4), few):
         yield larp(newton(rounds=6), again=again)
     # After sampling, and other gradients.
