@@ -38,8 +38,8 @@ class Preset:
     stand: Stage = (STAND,)
 
 
-# Points of `tasks.benchmarks.tradeoff`. Over its 16 kicks a little sampling in the replans of `balanced` missed by less,
-# over 64 others by a quarter more.
+# Points of `tasks.benchmarks.tradeoff`. Over its 16 kicks `balanced` did better with a little sampling in its replans,
+# over 64 others worse.
 PRESETS = {
     "fast": Preset((GaussNewton(rounds=4),), (GaussNewton(rounds=1),), every=5),
     "balanced": Preset((GaussNewton(rounds=12),), (GaussNewton(rounds=1),), every=1),
