@@ -411,8 +411,8 @@ class PlannerProblem:
         for begin in range(0, len(knots), size):
             rows = np.minimum(np.arange(begin, begin + size), len(knots) - 1)
             states, controls = planner._run(name, partial(planner._roll_out, dynamics), self.wanted, knots[rows])
-            weighed = planner._run("weigh", planner._weigh, self.wanted, states, controls, self.corrections)
-            found.append((weighed, states))
+            tried = planner._run("weigh", planner._weigh, self.wanted, states, controls, self.corrections)
+            found.append((tried, states))
         if len(knots) == size:
             return self._recorded(knots, *found[0])
         tried, states = jax.tree.map(lambda *parts: np.concatenate(parts)[: len(knots)], *found)

@@ -11,6 +11,9 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+# Colour of the noise where an optimiser does not say it.
+COLOUR = 2.0
+
 
 class Search(NamedTuple):
     """What one optimiser hands to the next within a plan."""
@@ -106,10 +109,6 @@ def merged(search: Search, knots: np.ndarray, costs: np.ndarray) -> Search:
     copies = np.setdiff1d(np.arange(len(both)), once)
     order = np.concatenate([once, copies])[: len(search.elites)]
     return search._replace(elites=both[order], costs=np.where(np.isin(order, copies), np.inf, known[order]))
-
-
-# Colour of the noise where an optimiser does not say it.
-COLOUR = 2.0
 
 
 def coloured_noise(random: np.random.Generator, shape: tuple[int, ...], exponent: float) -> np.ndarray:

@@ -8,7 +8,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from mpc.dynamics import Dynamics
-from mpc.search import Optimizer, Problem, Residuals, Search, distinct
+from mpc.search import Optimizer, Problem, Residuals, Search, distinct, merged
 
 
 class Trial(NamedTuple):
@@ -86,9 +86,12 @@ class Verified:
             search = search._replace(mean=best.knots, elites=elites, costs=np.full(len(elites), np.inf, np.float32))
             search = self.optimizer.improve(search, random, inner)
             proposed = search.elites[np.isfinite(search.costs)]
-        # Where none is finite, the plan carried on stays.
-        tried.sort(key=lambda trial: (trial.cost, not np.array_equal(trial.knots, problem.carried)))
-        return led_by(tried, search)
+        # What the planner's own dynamics said counts no more; where no trial is finite, the plan carried on stays.
+        elites = np.concatenate([problem.carried[None], search.elites[:-1]])
+        search = search._replace(elites=elites, costs=np.full(len(elites), np.inf, np.float32))
+        return merged(
+            search, np.stack([each.knots for each in tried]), np.array([each.cost for each in tried], np.float32)
+        )
 
     def suffices(self, trial: Trial) -> bool:
         """Whether no further trial is needed."""
@@ -110,15 +113,3 @@ def untried(knots: np.ndarray, tried: list[Trial]) -> np.ndarray:
     """Those of knots (N, K, J, 3) that were not tried yet, in their order, each once."""
     known = {trial.knots.tobytes() for trial in tried}
     return knots[[row for row in distinct(knots) if knots[row].tobytes() not in known]]
-
-
-def led_by(tried: list[Trial], search: Search) -> Search:
-    """The search with its elites led by what was tried, whose costs alone are known."""
-    rest, count = untried(search.elites, tried), len(search.elites)
-    elites = np.concatenate([np.stack([trial.knots for trial in tried]), rest])
-    costs = np.array([trial.cost for trial in tried] + [np.inf] * len(rest), np.float32)
-    missing = max(0, count - len(elites))
-    return search._replace(
-        elites=np.concatenate([elites, np.repeat(elites[:1], missing, axis=0)])[:count],
-        costs=np.concatenate([costs, np.full(missing, np.inf, np.float32)])[:count],
-    )
