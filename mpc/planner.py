@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -13,14 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from mpc.cost import CostTerm, curvatures, evaluate, require_weight, residuals, weighed
+from mpc.cost import CostTerm, require_weight
 from mpc.dynamics import Dynamics
-from mpc.search import COLOUR, Optimizer, Residuals, Search, Tried, coloured_noise
-from mpc.spline import Interpolation, interpolate, shift
-
-# Every size is compiled apart, a kick's for 8 s. So candidates are rolled out so many at a time, where there are few of
-# them: on a CPU one of 8 costs 1.1 ms, one of 24 1.0 ms.
-SIDE_BY_SIDE, FEW = 8, 32
+from mpc.problem import Equations, PlannerProblem, Programs, Wanted
+from mpc.search import COLOUR, Optimizer, Search, coloured_noise
+from mpc.spline import Interpolation, shift
 
 
 class Plan(NamedTuple):
@@ -102,7 +97,10 @@ class Planner:
         self.control_times = dt * np.arange(horizon, dtype=np.float32)
         self.knot_times = np.linspace(0, self.control_times[-1], knots, dtype=np.float32)
         self._programs = Programs()
-        self._controls = jax.jit(self._controls_of)
+        self._equations = Equations(
+            dynamics, self.terms, self.knot_times, self.control_times, interpolation, self.lower, self.upper
+        )
+        self._controls = jax.jit(self._equations.controls)
         self._use(optimizers)
 
     def using(self, optimizers: Optimizer | Sequence[Optimizer]) -> Planner:
@@ -156,7 +154,7 @@ class Planner:
         begin, compiled = time.perf_counter(), self._programs.seconds
         random = np.random.default_rng(plan.key)
         search = self._shifted(plan, now - float(plan.start), random)
-        problem = PlannerProblem(self, wanted, search.elites[0])
+        problem = PlannerProblem(self._equations, self._programs, wanted, search.elites[0])
         for optimizer in self.optimizers:
             search = optimizer.improve(search, random, problem)
             if len(search.elites) != self.elites:
@@ -165,12 +163,12 @@ class Planner:
         known = np.isfinite(search.costs)[:, None, None, None]
         after = Plan(np.where(known, search.elites, search.elites[0]), search.spread, np.float32(now), _entropy(random))
         states = problem.states_of(after.knots)
-        cost, terms = self._run("judge", self._judge, wanted, after.knots, states)
+        cost, terms = problem.judged(after.knots)
         compile_seconds = self._programs.seconds - compiled
         record = problem.record
         return after, PlanInfo(
-            cost=float(cost),
-            terms={name: float(value) for name, value in terms.items()},
+            cost=cost,
+            terms=terms,
             states=np.delete(states, np.s_[self.horizon if steps is None else steps : self.horizon], axis=0),
             costs=record.costs,
             elite_costs=search.costs,
@@ -197,60 +195,10 @@ class Planner:
         """Joint targets (H, J, 3) [rad] of the plan, given the reference (H, J, 3) it was made around."""
         return self._controls(plan.knots, self._reference(reference))
 
-    # What is compiled: pure functions of arrays alone.
-
-    def _roll_out(self, dynamics: Dynamics, wanted: Wanted, knots: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """States (N, H', L, 13) and controls (N, H, J, 3) of knots (N, K, J, 3)."""
-        controls = jax.vmap(self._controls_of, (0, None))(knots, wanted.reference)
-        start = jnp.broadcast_to(wanted.state, (len(knots), *wanted.state.shape))
-        return dynamics.rollout(start, controls, *([] if wanted.steps is None else [wanted.steps])), controls
-
-    def _weigh(
-        self, wanted: Wanted, states: jax.Array, controls: jax.Array, corrections: Any
-    ) -> tuple[jax.Array, Any, Any]:
-        """Costs, residuals and their curvatures of N candidates, the residuals moved by corrections."""
-
-        def one(states: jax.Array, controls: jax.Array) -> tuple[jax.Array, Any, Any]:
-            found = residuals(self.terms, states, controls, wanted.context, corrections)
-            cost, _ = weighed(self.terms, found, states, wanted.weights)
-            return cost, found, curvatures(self.terms, found, wanted.weights)
-
-        return jax.vmap(one)(states, controls)
-
-    def _gradients(self, wanted: Wanted, knots: jax.Array, corrections: Any) -> tuple[jax.Array, Any, jax.Array]:
-        def summed(knots: jax.Array) -> tuple[jax.Array, Any]:
-            states, controls = self._roll_out(self.dynamics, wanted, knots)
-            tried = self._weigh(wanted, states, controls, corrections)
-            return jnp.sum(tried[0]), (tried, states)
-
-        gradient, (tried, states) = jax.grad(summed, has_aux=True)(knots)
-        return gradient, tried, states
-
-    def _tangents(self, wanted: Wanted, knots: jax.Array, directions: jax.Array) -> Any:
-        """Derivatives (D, ...) of the residuals at knots (K, J, 3) along directions (D, K, J, 3)."""
-
-        def found(knots: jax.Array) -> Any:
-            states, controls = (leaf[0] for leaf in self._roll_out(self.dynamics, wanted, knots[None]))
-            return residuals(self.terms, states, controls, wanted.context)
-
-        return jax.vmap(lambda direction: jax.jvp(found, (knots,), (direction,))[1])(directions)
-
-    def _judge(self, wanted: Wanted, knots: jax.Array, states: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Cost and each term's share of knots (K, J, 3) that led to states (H', L, 13)."""
-        controls = self._controls_of(knots, wanted.reference)
-        return evaluate(self.terms, states, controls, wanted.context, wanted.weights)
-
     def _shift(self, elites: jax.Array, spread: jax.Array, elapsed: jax.Array) -> tuple[jax.Array, jax.Array]:
         times = jnp.asarray(self.knot_times)
         elites = jax.vmap(lambda knots: shift(knots, times, elapsed, self.interpolation))(elites)
         return elites, shift(spread, times, elapsed, "linear")  # a cubic could swing below zero
-
-    def _controls_of(self, knots: jax.Array, reference: jax.Array) -> jax.Array:
-        times = jnp.asarray(self.knot_times), jnp.asarray(self.control_times)
-        return jnp.clip(reference + interpolate(knots, *times, self.interpolation), self.lower, self.upper)
-
-    def _run(self, name: Any, function: Callable[..., Any], *arguments: Any) -> Any:
-        return jax.block_until_ready(self._programs(name, function, *arguments))
 
     def _shifted(self, plan: Plan, elapsed: float, random: np.random.Generator) -> Search:
         """The last plan's search as it looks `elapsed` [s] later, its spread widened, its costs unknown.
@@ -262,7 +210,7 @@ class Planner:
         if missing:
             drawn = plan.spread * coloured_noise(random, (missing, *plan.knots.shape), COLOUR)
             elites = np.concatenate([elites, plan.knots + drawn])
-        elites, spread = map(np.asarray, self._run("shift", self._shift, elites, plan.spread, np.float32(elapsed)))
+        elites, spread = map(np.asarray, self._programs("shift", self._shift, elites, plan.spread, np.float32(elapsed)))
         spread = spread + self.reheat * np.maximum(self.scale - spread, 0.0)
         return Search(elites[0], spread, elites, np.full(self.elites, np.inf, np.float32), self.scale)
 
@@ -317,113 +265,6 @@ class Planner:
         names = [term.name for term in self.terms]
         if not names or len(set(names)) < len(names):
             raise ValueError(f"terms: got {names}, needs at least one, each with its own name")
-
-
-class Wanted(NamedTuple):
-    """What one plan is for: arrays of NumPy, and of JAX in what is compiled."""
-
-    state: Any  # (L, 13), where it starts
-    reference: Any  # (H, J, 3) rad
-    context: Any
-    weights: dict[str, Any]
-    steps: Any | None  # (), so many of the H suffice
-
-
-class Programs:
-    """Compiled functions, by name and shapes of arguments, and the seconds that compiling took."""
-
-    def __init__(self) -> None:
-        self.seconds = 0.0
-        self._compiled: dict[Any, Any] = {}
-
-    def __call__(self, name: Any, function: Callable[..., Any], *arguments: Any) -> Any:
-        """What the function gives, compiled first where that is needed; `name` stands for the function."""
-        leaves, structure = jax.tree.flatten(arguments)
-        signature = name, structure, tuple((np.shape(leaf), leaf.dtype) for leaf in leaves)
-        if signature not in self._compiled:
-            begin = time.perf_counter()
-            # The function is kept, too: as long as it is, what its name stands for is.
-            self._compiled[signature] = jax.jit(function).lower(*arguments).compile(), function
-            self.seconds += time.perf_counter() - begin
-        return self._compiled[signature][0](*arguments)
-
-
-@dataclass
-class Record:
-    """What was tried while one plan was made."""
-
-    costs: list[np.ndarray] = field(default_factory=list)
-    verified: int = 0
-    best: dict[bytes, np.ndarray] = field(default_factory=dict)  # states (H', L, 13) by the knots of a round's best
-
-
-@dataclass(frozen=True)
-class PlannerProblem:
-    """The `search.Problem` of one plan."""
-
-    planner: Planner
-    wanted: Wanted
-    carried: np.ndarray
-    corrections: Residuals = field(default_factory=dict)
-    record: Record = field(default_factory=Record)
-
-    def tries(self, knots: np.ndarray) -> Tried:
-        """See `search.Problem`."""
-        few = len(knots) <= (FEW if jax.default_backend() == "cpu" else SIDE_BY_SIDE)
-        return self._tries(self.planner.dynamics, knots, SIDE_BY_SIDE if few else len(knots))
-
-    def gradients(self, knots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `search.Problem`."""
-        gradient, tried, states = self.planner._run(
-            "gradients", self.planner._gradients, self.wanted, knots, self.corrections
-        )
-        return self._recorded(knots, tried, states).costs, np.asarray(gradient)
-
-    def tangents(self, knots: np.ndarray, directions: np.ndarray) -> Residuals:
-        """See `search.Problem`."""
-        found = self.planner._run("tangents", self.planner._tangents, self.wanted, knots, directions)
-        return {name: np.asarray(each) for name, each in found.items()}
-
-    def lost(self, count: int) -> None:
-        """See `search.Problem`."""
-        if count:
-            self.record.costs.append(np.full(count, np.inf, np.float32))
-
-    def trials(self, dynamics: Dynamics, knots: np.ndarray) -> Tried:
-        """See `search.Problem`."""
-        self.record.verified += len(knots)
-        apart = replace(self, corrections={}, record=Record(self.record.costs))
-        return apart._tries(dynamics, knots, len(knots))
-
-    def corrected(self, corrections: Residuals) -> PlannerProblem:
-        """See `search.Problem`."""
-        return replace(self, corrections={name: each[0] for name, each in corrections.items()})
-
-    def states_of(self, knots: np.ndarray) -> np.ndarray:
-        """What the dynamics make of knots (K, J, 3): states (H', L, 13)."""
-        if knots.tobytes() not in self.record.best:
-            self.tries(knots[None])
-        return self.record.best[knots.tobytes()]
-
-    def _tries(self, dynamics: Dynamics, knots: np.ndarray, size: int) -> Tried:
-        """`size` candidates at a time, the last ones filled up."""
-        planner, name, found = self.planner, ("roll out", id(dynamics)), []
-        for begin in range(0, len(knots), size):
-            rows = np.minimum(np.arange(begin, begin + size), len(knots) - 1)
-            states, controls = planner._run(name, partial(planner._roll_out, dynamics), self.wanted, knots[rows])
-            tried = planner._run("weigh", planner._weigh, self.wanted, states, controls, self.corrections)
-            found.append((tried, states))
-        if len(knots) == size:
-            return self._recorded(knots, *found[0])
-        tried, states = jax.tree.map(lambda *parts: np.concatenate(parts)[: len(knots)], *found)
-        return self._recorded(knots, tried, states)
-
-    def _recorded(self, knots: np.ndarray, tried: Any, states: jax.Array) -> Tried:
-        found = Tried(*jax.tree.map(np.asarray, tried))
-        self.record.costs.append(found.costs)
-        best = int(np.argmin(found.costs))
-        self.record.best[knots[best].tobytes()] = np.asarray(states)[best].copy()
-        return found
 
 
 def _entropy(random: np.random.Generator) -> np.ndarray:

@@ -39,6 +39,7 @@ ORDER = [
     "mpc.gradient",
     "mpc.gauss_newton",
     "mpc.verified",
+    "mpc.problem",
     "mpc.planner",
     "mpc.loop",
     "mpc",

@@ -1,0 +1,199 @@
+"""The planner's problem: its equations, compiled, and what the optimisers of one plan may ask of it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mpc.cost import CostTerm, curvatures, evaluate, residuals, weighed
+from mpc.dynamics import Dynamics
+from mpc.search import Residuals, Tried
+from mpc.spline import Interpolation, interpolate
+
+# Every size is compiled apart, a kick's for 8 s. So candidates are rolled out so many at a time, where there are few of
+# them: on a CPU one of 8 costs 1.1 ms, one of 24 1.0 ms.
+SIDE_BY_SIDE, FEW = 8, 32
+
+
+class Wanted(NamedTuple):
+    """What one plan is for: arrays of NumPy, and of JAX in what is compiled."""
+
+    state: Any  # (L, 13), where it starts
+    reference: Any  # (H, J, 3) rad
+    context: Any
+    weights: dict[str, Any]
+    steps: Any | None  # (), so many of the H suffice
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """The planner's equations as pure functions of arrays; see `planner.Planner`, which states them.
+
+    knot_times (K,), control_times (H,) [s]. lower, upper (J, 3) [rad].
+    """
+
+    dynamics: Dynamics
+    terms: tuple[CostTerm, ...]
+    knot_times: np.ndarray
+    control_times: np.ndarray
+    interpolation: Interpolation
+    lower: np.ndarray
+    upper: np.ndarray
+
+    def controls(self, knots: jax.Array, reference: jax.Array) -> jax.Array:
+        """Joint targets (H, J, 3) [rad] of knots (K, J, 3) around a reference (H, J, 3)."""
+        times = jnp.asarray(self.knot_times), jnp.asarray(self.control_times)
+        return jnp.clip(reference + interpolate(knots, *times, self.interpolation), self.lower, self.upper)
+
+    def roll_out(self, dynamics: Dynamics, wanted: Wanted, knots: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """States (N, H', L, 13) and controls (N, H, J, 3) of knots (N, K, J, 3)."""
+        controls = jax.vmap(self.controls, (0, None))(knots, wanted.reference)
+        start = jnp.broadcast_to(wanted.state, (len(knots), *wanted.state.shape))
+        return dynamics.rollout(start, controls, *([] if wanted.steps is None else [wanted.steps])), controls
+
+    def weigh(
+        self, wanted: Wanted, states: jax.Array, controls: jax.Array, corrections: Any
+    ) -> tuple[jax.Array, Any, Any]:
+        """Costs, residuals and their curvatures of N candidates, the residuals moved by corrections."""
+
+        def one(states: jax.Array, controls: jax.Array) -> tuple[jax.Array, Any, Any]:
+            found = residuals(self.terms, states, controls, wanted.context, corrections)
+            cost, _ = weighed(self.terms, found, states, wanted.weights)
+            return cost, found, curvatures(self.terms, found, wanted.weights)
+
+        return jax.vmap(one)(states, controls)
+
+    def gradients(self, wanted: Wanted, knots: jax.Array, corrections: Any) -> tuple[jax.Array, Any, jax.Array]:
+        """Gradients (N, K, J, 3) of the costs of knots (N, K, J, 3), what `weigh` finds, and the states."""
+
+        def summed(knots: jax.Array) -> tuple[jax.Array, Any]:
+            states, controls = self.roll_out(self.dynamics, wanted, knots)
+            tried = self.weigh(wanted, states, controls, corrections)
+            return jnp.sum(tried[0]), (tried, states)
+
+        gradient, (tried, states) = jax.grad(summed, has_aux=True)(knots)
+        return gradient, tried, states
+
+    def tangents(self, wanted: Wanted, knots: jax.Array, directions: jax.Array) -> Any:
+        """Derivatives (D, ...) of the residuals at knots (K, J, 3) along directions (D, K, J, 3)."""
+
+        def found(knots: jax.Array) -> Any:
+            states, controls = (leaf[0] for leaf in self.roll_out(self.dynamics, wanted, knots[None]))
+            return residuals(self.terms, states, controls, wanted.context)
+
+        return jax.vmap(lambda direction: jax.jvp(found, (knots,), (direction,))[1])(directions)
+
+    def judge(self, wanted: Wanted, knots: jax.Array, states: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Cost and each term's share of knots (K, J, 3) that led to states (H', L, 13)."""
+        controls = self.controls(knots, wanted.reference)
+        return evaluate(self.terms, states, controls, wanted.context, wanted.weights)
+
+
+class Programs:
+    """Compiled functions, by name and shapes of arguments, and the seconds that compiling took."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._compiled: dict[Any, Any] = {}
+
+    def __call__(self, name: Any, function: Callable[..., Any], *arguments: Any) -> Any:
+        """What the function gives, finished, compiled first where needed; `name` stands for the function."""
+        leaves, structure = jax.tree.flatten(arguments)
+        signature = name, structure, tuple((np.shape(leaf), leaf.dtype) for leaf in leaves)
+        if signature not in self._compiled:
+            begin = time.perf_counter()
+            # The function is kept, too: as long as it is, what its name stands for is.
+            self._compiled[signature] = jax.jit(function).lower(*arguments).compile(), function
+            self.seconds += time.perf_counter() - begin
+        return jax.block_until_ready(self._compiled[signature][0](*arguments))
+
+
+@dataclass
+class Record:
+    """What was tried while one plan was made."""
+
+    costs: list[np.ndarray] = field(default_factory=list)
+    verified: int = 0
+    best: dict[bytes, np.ndarray] = field(default_factory=dict)  # states (H', L, 13) by the knots of a round's best
+
+
+@dataclass(frozen=True)
+class PlannerProblem:
+    """The `search.Problem` of one plan."""
+
+    equations: Equations
+    run: Programs
+    wanted: Wanted
+    carried: np.ndarray
+    corrections: Residuals = field(default_factory=dict)
+    record: Record = field(default_factory=Record)
+
+    def tries(self, knots: np.ndarray) -> Tried:
+        """See `search.Problem`."""
+        few = len(knots) <= (FEW if jax.default_backend() == "cpu" else SIDE_BY_SIDE)
+        return self._tries(self.equations.dynamics, knots, SIDE_BY_SIDE if few else len(knots))
+
+    def gradients(self, knots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `search.Problem`."""
+        arguments = self.wanted, knots, self.corrections
+        gradient, tried, states = self.run("gradients", self.equations.gradients, *arguments)
+        return self._recorded(knots, tried, states).costs, np.asarray(gradient)
+
+    def tangents(self, knots: np.ndarray, directions: np.ndarray) -> Residuals:
+        """See `search.Problem`."""
+        found = self.run("tangents", self.equations.tangents, self.wanted, knots, directions)
+        return {name: np.asarray(each) for name, each in found.items()}
+
+    def lost(self, count: int) -> None:
+        """See `search.Problem`."""
+        if count:
+            self.record.costs.append(np.full(count, np.inf, np.float32))
+
+    def trials(self, dynamics: Dynamics, knots: np.ndarray) -> Tried:
+        """See `search.Problem`."""
+        self.record.verified += len(knots)
+        apart = replace(self, corrections={}, record=Record(self.record.costs))
+        return apart._tries(dynamics, knots, len(knots))
+
+    def corrected(self, corrections: Residuals) -> PlannerProblem:
+        """See `search.Problem`."""
+        return replace(self, corrections={name: each[0] for name, each in corrections.items()})
+
+    def states_of(self, knots: np.ndarray) -> np.ndarray:
+        """What the dynamics make of knots (K, J, 3): states (H', L, 13)."""
+        if knots.tobytes() not in self.record.best:
+            self.tries(knots[None])
+        return self.record.best[knots.tobytes()]
+
+    def judged(self, knots: np.ndarray) -> tuple[float, dict[str, float]]:
+        """Cost of knots (K, J, 3) and each term's share of it."""
+        cost, terms = self.run("judge", self.equations.judge, self.wanted, knots, self.states_of(knots))
+        return float(cost), {name: float(value) for name, value in terms.items()}
+
+    def _tries(self, dynamics: Dynamics, knots: np.ndarray, size: int) -> Tried:
+        """`size` candidates at a time, the last ones filled up."""
+        name, found = ("roll out", id(dynamics)), []
+        for begin in range(0, len(knots), size):
+            rows = np.minimum(np.arange(begin, begin + size), len(knots) - 1)
+            roll_out = partial(self.equations.roll_out, dynamics)
+            states, controls = self.run(name, roll_out, self.wanted, knots[rows])
+            tried = self.run("weigh", self.equations.weigh, self.wanted, states, controls, self.corrections)
+            found.append((tried, states))
+        if len(knots) == size:
+            return self._recorded(knots, *found[0])
+        tried, states = jax.tree.map(lambda *parts: np.concatenate(parts)[: len(knots)], *found)
+        return self._recorded(knots, tried, states)
+
+    def _recorded(self, knots: np.ndarray, tried: Any, states: jax.Array) -> Tried:
+        found = Tried(*jax.tree.map(np.asarray, tried))
+        self.record.costs.append(found.costs)
+        best = int(np.argmin(found.costs))
+        self.record.best[knots[best].tobytes()] = np.asarray(states)[best].copy()
+        return found
