@@ -148,9 +148,33 @@ def human(
 
 def human_and_ball(height: float = 1.75, mass: float = 70.0, dt: float = 0.01) -> Scene:
     """The kick's scene: a human and a football; thighs, shins and feet can touch the ball."""
-    person, football = human(height=height, mass=mass), ball()
-    pair = Pair(person.name, football.name, KICKING_LINKS, ("ball",), football.surface)
-    return Scene((person, football), (pair,), dt)
+    return _kicking(human(height=height, mass=mass), ball(), dt)
+
+
+def human_and_capsule(height: float = 1.75, mass: float = 70.0, dt: float = 0.01) -> Scene:
+    """A human who can kick a capsule with thighs, shins and feet."""
+    return _kicking(human(height=height, mass=mass), capsule(), dt)
+
+
+def _kicking(person: Body, struck: Body, dt: float) -> Scene:
+    pair = Pair(person.name, struck.name, KICKING_LINKS, tuple(link.name for link in struck.links), struck.surface)
+    return Scene((person, struck), (pair,), dt)
+
+
+def two_chains(links: int = 2, dt: float = 0.01) -> Scene:
+    """Two chains of so many links each, all of which can touch the other chain's."""
+    return _colliding(chain("first", links), chain("second", links), dt)
+
+
+def two_balls(dt: float = 0.01) -> Scene:
+    """Two footballs that can touch."""
+    return _colliding(ball("first"), ball("second"), dt)
+
+
+def _colliding(first: Body, second: Body, dt: float) -> Scene:
+    """Two bodies with the same links."""
+    links = tuple(link.name for link in first.links)
+    return Scene((first, second), (Pair(first.name, second.name, links, links, first.surface),), dt)
 
 
 def standing_height(body: Body) -> float:

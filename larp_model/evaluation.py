@@ -11,6 +11,7 @@ import numpy as np
 
 from larp_model import features, rotation
 from larp_model import state as packed
+from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from larp_model.training import Trajectories, first_contacts
 
@@ -37,7 +38,8 @@ def predict(
 def evaluate(simulator: Simulator, episodes: Trajectories, windows: Sequence[int]) -> dict[str, Any]:
     """Errors over the first n steps of every episode, n in `windows`, and of the launch; see `launch`.
 
-    windows: {n: {body: mean distance of its links [m]}}; rotation_rad and displacement_m over the longest window.
+    windows: {n: {body: mean distance of its links [m]}}; rotation_rad and displacement_m over the longest window. None
+    where all predictions diverged.
     """
     longest = max(windows)
     if episodes.controls.shape[1] < longest:
@@ -55,21 +57,29 @@ def evaluate(simulator: Simulator, episodes: Trajectories, windows: Sequence[int
     apart = features.displacement(scene, jnp.asarray(predicted[kept]), features.morphology(scene))
     return {
         "windows": {
-            str(n): {body.name: float(distance[kept, :n, scene.rows(body.name)].mean()) for body in scene.bodies}
+            str(n): {body.name: mean(distance[kept, :n, scene.rows(body.name)]) for body in scene.bodies}
             for n in windows
         },
         "rotation_rad": {
-            body.name: float(
-                jnp.linalg.norm(rotation.to_rotation_vector(relative[:, :, scene.rows(body.name)]), axis=-1).mean()
+            body.name: mean(
+                jnp.linalg.norm(rotation.to_rotation_vector(relative[:, :, scene.rows(body.name)]), axis=-1)
             )
             for body in scene.bodies
             if not body.is_ball
         },
-        "displacement_m": float(jnp.linalg.norm(apart, axis=-1).mean()) if apart.shape[-2] else 0.0,
+        "displacement_m": mean(jnp.linalg.norm(apart, axis=-1)) if apart.shape[-2] else 0.0,
         "sequences": len(episodes.states),
         "diverged": int(lost.sum()),
-        "launch": {str(before): launch(simulator, episodes, before) for before in (0, 3)} if scene.pairs else {},
+        "launch": {str(before): launch(simulator, episodes, before) for before in (0, 3)} if struck(scene) else {},
     }
+
+
+def struck(scene: Scene) -> int | None:
+    """The row of the link that others strike, if there is one: the second body of the first pair, if of one link."""
+    for pair in scene.pairs[:1]:
+        if len(scene.body(pair.second).links) == 1:
+            return scene.index(pair.second, pair.second_links[0])
+    return None
 
 
 def launch(simulator: Simulator, episodes: Trajectories, before: int) -> dict[str, Any]:
@@ -78,11 +88,13 @@ def launch(simulator: Simulator, episodes: Trajectories, before: int) -> dict[st
     Over bodies that leave faster than `LAUNCH_SPEED`; relative_error is |v - v'| / |v|, angle_deg between them.
     """
     scene = simulator.scene
-    struck = scene.index(scene.pairs[0].second, scene.pairs[0].second_links[0])
+    row = struck(scene)
+    if row is None:
+        raise ValueError("simulator.scene has no body of one link that another can strike")
     contacts = first_contacts(scene, episodes.states)
     steps = before + LAUNCH_STEPS
     rows = np.flatnonzero((contacts >= before) & (contacts + LAUNCH_STEPS <= episodes.controls.shape[1]))
-    rows = rows[speed(episodes.states[rows, contacts[rows] + LAUNCH_STEPS, struck]) > LAUNCH_SPEED]
+    rows = rows[speed(episodes.states[rows, contacts[rows] + LAUNCH_STEPS, row]) > LAUNCH_SPEED]
     if not len(rows):
         return {"count": 0}
     start = contacts[rows] - before
@@ -90,8 +102,8 @@ def launch(simulator: Simulator, episodes: Trajectories, before: int) -> dict[st
     predicted = predict(
         simulator, episodes.states[rows, start], episodes.controls[rows[:, None], columns],
         episodes.torques[rows[:, None], columns],
-    )[:, -1, struck, packed.VELOCITY]  # fmt: skip
-    true = episodes.states[rows, start + steps, struck, packed.VELOCITY]
+    )[:, -1, row, packed.VELOCITY]  # fmt: skip
+    true = episodes.states[rows, start + steps, row, packed.VELOCITY]
     size = np.linalg.norm(true, axis=-1)
     error = np.linalg.norm(predicted - true, axis=-1) / size
     cosine = np.sum(predicted * true, axis=-1) / np.maximum(size * np.linalg.norm(predicted, axis=-1), 1e-9)
@@ -102,6 +114,11 @@ def launch(simulator: Simulator, episodes: Trajectories, before: int) -> dict[st
         "relative_error": quantiles(np.where(diverged, np.inf, error)),
         "angle_deg": quantiles(np.where(diverged, 180.0, angle)),
     }
+
+
+def mean(values: np.ndarray | jax.Array) -> float | None:
+    """Mean of all values; None where there are none."""
+    return float(values.mean()) if values.size else None
 
 
 def speed(links: np.ndarray) -> np.ndarray:

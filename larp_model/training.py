@@ -56,7 +56,7 @@ class Recipe:
     contact_share: float = 0.7
     before_contact: int = 10
     after_contact: int = 0
-    emphasis: tuple[tuple[str, float], ...] = (("ball", 3.0),)
+    emphasis: tuple[tuple[str, float], ...] = (("ball", 3.0), ("capsule", 3.0))
     loss: LossWeights = field(default_factory=LossWeights)
     stop_gradient: bool = True
     only: tuple[str, ...] = ()

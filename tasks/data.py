@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from larp_model import features
 from larp_model import state as packed
-from larp_model.scene import Scene
+from larp_model.scene import Link, Scene
 from larp_model.training import first_contacts
 from larp_model.truth.episodes import Episodes, record
-from larp_model.truth.mujoco import Truth
+from larp_model.truth.mujoco import Truth, closed
 from tasks.references import Reference
 
 STEPS, CONTACT_STEPS = 70, 10
@@ -55,47 +55,75 @@ def random_starts(
 ) -> tuple[np.ndarray, np.ndarray]:
     """States (count, L, 13) along the reference, disturbed and turned about z, and the steps (count,) they come from.
 
-    The ball waits where a foot will pass, or near its spot, or comes from anywhere.
+    What the human may strike, if anything, waits where a foot will pass, or near the ball's spot, or comes from
+    anywhere.
     """
     latest = len(reference.controls) - steps - 1
     from_start = random.random(count) < 0.5
     begin = np.where(from_start, 0, random.integers(0, min(120, latest), count))
-    states = reference.states[begin].copy()
-    human = len(scene.bodies[0].links)
+    rows = scene.rows("human")
+    human = len(scene.body("human").links)
+    states = np.zeros((count, len(scene.links), packed.SIZE))
+    states[:, rows] = reference.states[begin, :human]
     size = np.where(random.random(count) < 0.3, 0.0, random.uniform(0.0, 1.0, count))[:, None, None]
     tilt = Rotation.from_rotvec((0.06 * size * random.standard_normal((count, human, 3))).reshape(-1, 3))
-    turned = tilt * Rotation.from_quat(states[:, :human, packed.ORIENTATION].reshape(-1, 4), scalar_first=True)
-    states[:, :human, packed.ORIENTATION] = turned.as_quat(scalar_first=True).reshape(count, human, 4)
-    states[:, :human, packed.ANGULAR_VELOCITY] += 1.0 * size * random.standard_normal((count, human, 3))
-    states[:, 0, packed.VELOCITY] += 0.3 * size[:, 0] * random.standard_normal((count, 3))
-    states[:, :human, 2] += 0.02 * size[:, 0] * random.random((count, 1))
+    turned = tilt * Rotation.from_quat(states[:, rows, packed.ORIENTATION].reshape(-1, 4), scalar_first=True)
+    states[:, rows, packed.ORIENTATION] = turned.as_quat(scalar_first=True).reshape(count, human, 4)
+    states[:, rows, packed.ANGULAR_VELOCITY] += 1.0 * size * random.standard_normal((count, human, 3))
+    states[:, rows.start, packed.VELOCITY] += 0.3 * size[:, 0] * random.standard_normal((count, 3))
+    states[:, rows, 2] += 0.02 * size[:, 0] * random.random((count, 1))
+    states[:, rows] = closed(scene.only("human"), states[:, rows])
+    for pair in scene.pairs:
+        struck = scene.index(pair.second, pair.second_links[0])
+        states[:, struck] = random_places(random, scene, reference, struck, begin, steps)
+        # What is inside a leg is no initial state: it waits out of reach instead.
+        inside = overlaps(scene, states)
+        states[inside, struck, :2] = (3.0, 0.0)
+        states[inside, struck, 2] = resting(scene.links[struck], states[inside, struck])
+    return _turn(states, random.uniform(-np.pi, np.pi, count)), begin
 
-    radius = scene.bodies[-1].links[0].radius
-    ball = states[:, -1]
-    ball[:] = 0.0
-    ball[:, 3] = 1.0
+
+def random_places(
+    random: np.random.Generator, scene: Scene, reference: Reference, row: int, begin: np.ndarray, steps: int
+) -> np.ndarray:
+    """States (count, 13) of a link that the human may strike within so many `steps` from `begin` (count,) on."""
+    count, link = len(begin), scene.links[row]
+    found = np.zeros((count, packed.SIZE))
+    found[:, packed.ORIENTATION] = (1.0, 0.0, 0.0, 0.0)
+    if link.length:
+        lying = Rotation.from_rotvec(0.5 * np.pi * np.cross(link.axis, (1.0, 0.0, 0.0)))
+        about = Rotation.from_rotvec(random.uniform(-np.pi, np.pi, (count, 1)) * (0.0, 0.0, 1.0))
+        any_way = Rotation.from_quat(random.standard_normal((count, 4)))
+        flat = random.random((count, 1)) < 0.6
+        found[:, packed.ORIENTATION] = np.where(
+            flat, (about * lying).as_quat(scalar_first=True), any_way.as_quat(scalar_first=True)
+        )
+    lowest = resting(link, found)
     kind = random.random(count)
-    ball[:, :2] = reference.ball_spot[:2] + random.uniform(-0.06, 0.06, (count, 2))
-    ball[:, 2] = radius
-    foot = scene.index(scene.bodies[0].name, "right_foot")
+    found[:, :2] = reference.ball_spot[:2] + random.uniform(-0.06, 0.06, (count, 2))
+    found[:, 2] = lowest
+    foot = scene.index("human", "right_foot")
     met = np.clip(begin + random.integers(2, steps, count), 0, len(reference.states) - 1)
     crossing = kind > 0.35
     place = reference.states[met, foot, :3] + 0.08 * random.standard_normal((count, 3)) + (0.08, 0.0, 0.0)
-    place[:, 2] = np.where(random.random(count) < 0.6, radius, np.maximum(place[:, 2], radius))
-    ball[crossing, :3] = place[crossing]
+    place[:, 2] = np.where(random.random(count) < 0.6, lowest, np.maximum(place[:, 2], lowest))
+    found[crossing, :3] = place[crossing]
     rolling = kind > 0.6
     motion = random.standard_normal((count, 3)) * (2.0, 2.0, 1.0)
-    ball[rolling, 7:10] = motion[rolling]
+    found[rolling, 7:10] = motion[rolling]
     away = ((met - begin) * scene.dt * random.uniform(0.0, 1.0, count))[:, None] * motion * (1.0, 1.0, 0.0)
-    ball[rolling, :3] -= away[rolling]
+    found[rolling, :3] -= away[rolling]
     flying = kind > 0.85
-    ball[flying, 2] += random.uniform(0.0, 1.0, count)[flying]
-    ball[rolling, 10:13] = 8.0 * random.standard_normal((count, 3))[rolling]
-    ball[:, 2] = np.maximum(ball[:, 2], radius)
-    states[:, -1] = ball
-    # A ball inside a leg is no initial state: it waits out of reach instead.
-    states[overlaps(scene, states), -1, :3] = (3.0, 0.0, radius)
-    return _turn(states, random.uniform(-np.pi, np.pi, count)), begin
+    found[flying, 2] += random.uniform(0.0, 1.0, count)[flying]
+    found[rolling, 10:13] = 8.0 * random.standard_normal((count, 3))[rolling]
+    found[:, 2] = np.maximum(found[:, 2], lowest)
+    return found
+
+
+def resting(link: Link, states: np.ndarray) -> np.ndarray:
+    """Height (N,) [m] at which a link in states (N, 13) touches the ground, turned as it is."""
+    turned = Rotation.from_quat(states[:, packed.ORIENTATION], scalar_first=True)
+    return link.radius + 0.5 * link.length * np.abs(turned.apply(link.axis)[:, 2])
 
 
 def overlaps(scene: Scene, states: np.ndarray) -> np.ndarray:
@@ -134,8 +162,8 @@ def random_episodes(
     controls = np.clip(controls, lower, upper)
     torques = np.zeros((count, steps, len(scene.links), 3))
     pushed = np.flatnonzero(random.random(count) < 0.1)
-    human = len(scene.bodies[0].links)
-    torques[pushed, :10, :human] = 4.0 * random.standard_normal((len(pushed), 1, human, 3))
+    human = scene.rows("human")
+    torques[pushed, :10, human] = 4.0 * random.standard_normal((len(pushed), 1, human.stop - human.start, 3))
     return record(Truth(scene, batch=min(count, 256)), states, controls, torques)
 
 
@@ -152,14 +180,15 @@ def contact_episodes(
     begin = np.maximum(contacts[rows] - random.integers(0, 4, count), 0)
     states = source.states[rows, begin].astype(float)
     columns = begin[:, None] + np.arange(steps)
-    human = len(scene.bodies[0].links)
+    human, pair = scene.rows("human"), scene.pairs[0]
+    struck = scene.index(pair.second, pair.second_links[0])
     size = random.uniform(0.0, 1.0, (count, 1, 1))
-    states[:, :human, packed.ANGULAR_VELOCITY] += 2.0 * size * random.standard_normal((count, human, 3))
-    states[:, 0, packed.VELOCITY] += 0.4 * size[:, 0] * random.standard_normal((count, 3))
-    ball = states[:, -1]
-    ball[:, packed.POSITION] += 0.03 * size[:, 0] * random.standard_normal((count, 3)) * (1.0, 1.0, 0.3)
-    ball[:, 2] = np.maximum(ball[:, 2], scene.bodies[-1].links[0].radius)
-    ball[:, packed.VELOCITY] *= random.uniform(0.5, 1.5, (count, 1))
+    states[:, human, packed.ANGULAR_VELOCITY] += 2.0 * size * random.standard_normal(states[:, human, 10:].shape)
+    states[:, human.start, packed.VELOCITY] += 0.4 * size[:, 0] * random.standard_normal((count, 3))
+    place = states[:, struck]
+    place[:, packed.POSITION] += 0.03 * size[:, 0] * random.standard_normal((count, 3)) * (1.0, 1.0, 0.3)
+    place[:, 2] = np.maximum(place[:, 2], resting(scene.links[struck], place))
+    place[:, packed.VELOCITY] *= random.uniform(0.5, 1.5, (count, 1))
     controls = source.controls[rows[:, None], columns] + 0.5 * size[..., None] * smooth_noise(
         random, count, steps, 4, stray(scene)
     )

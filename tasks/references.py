@@ -13,7 +13,7 @@ from larp_model import bodies
 from larp_model import state as packed
 from larp_model.bodies import standing_height
 from larp_model.scene import Scene
-from larp_model.truth.mujoco import Truth, finite
+from larp_model.truth.mujoco import Truth, closed, finite
 from tasks import bvh, key_poses
 from tasks.key_poses import KeyPoses
 from tasks.tracking import Tracker
@@ -60,18 +60,16 @@ def standing_on_ground(scene: Scene, targets: np.ndarray, root: Rotation) -> np.
         rotations.append(rotations[joint.parent] * Rotation.from_rotvec(turn))
     for row, rotation in enumerate(rotations):
         states[:, row, packed.ORIENTATION] = rotation.as_quat(scalar_first=True)
-    truth = Truth(scene.only(human.name), batch=count)
-    truth.reset(states[:, : len(human.links)])
-    closed = truth.state()
+    stood = closed(scene.only(human.name), states[:, : len(human.links)])
     lowest = np.min(
         [
-            closed[:, row, 2] - abs(0.5 * link.length * rotations[row].apply(link.axis)[:, 2]) - link.radius
+            stood[:, row, 2] - abs(0.5 * link.length * rotations[row].apply(link.axis)[:, 2]) - link.radius
             for row, link in enumerate(human.links)
         ],
         axis=0,
     )
-    closed[..., 2] -= lowest[:, None]
-    states[:, : len(human.links)] = closed
+    stood[..., 2] -= lowest[:, None]
+    states[:, : len(human.links)] = stood
     return states
 
 

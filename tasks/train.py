@@ -1,4 +1,4 @@
-"""From nothing to the shipped weights: truth episodes, training, the planner's own candidates, evaluation.
+"""From nothing to the weights of a scene: truth episodes, training, the planner's own candidates, evaluation.
 
 Every stage leaves a file in the run's folder and is skipped where that file is there; training itself goes on from
 its last checkpoint. So the same command takes up a run that was cut off.
@@ -29,9 +29,10 @@ from larp_model.truth import episodes as truth_episodes
 from larp_model.truth.episodes import Episodes
 from larp_model.truth.mujoco import SUBSTEPS, Truth
 from mpc import CEM
-from tasks.data import WINDOWS, contact_episodes, random_episodes, random_task
+from tasks.data import contact_episodes, random_task
 from tasks.kick import WEIGHTS, Kick, models_of, planners_of, prepare, remember_compilations, run
 from tasks.presets import Preset
+from tasks.scenarios import scenario
 
 EVALUATION_SEED = 1
 # How the planner searches for the candidates that it is trained on: by sampling, for a step by gradients tries few.
@@ -63,7 +64,9 @@ IMPACTS = replace(
 # The contact's own networks would pay for that with the ball's velocity, and are not trained with it.
 PRECISE = LOSS._replace(position=100.0, rotation=16.0, far=1e-3)
 RESPONSES = replace(IMPACTS, updates=8000, only=RESPONSE, loss=PRECISE)
-STAGES = (
+# Of scenes in which nothing is planned: steps, then rollouts of all networks together.
+GENERAL = (Stage("steps", "", STEPS), Stage("rollouts", "", replace(ROLLOUTS, only=())))
+KICK = (
     Stage("steps", "", STEPS),
     Stage("rollouts", "", ROLLOUTS),
     Stage("planned1", "planned", AGAIN),
@@ -120,54 +123,58 @@ def stored_episodes(path: Path, scene: Scene, make: Callable[[], tuple[Episodes,
 
 
 def main(
-    folder: Path = Path("runs/train"),
-    out: Path = Path("runs/train/weights"),
+    scene: str = WEIGHTS,
+    folder: Path | None = None,
+    out: Path | None = None,
     episodes: int = 10000,
     tasks: int = 30,
     effort: float = 1.0,
     seed: int = 100,
 ) -> None:
-    """Train the kick's learned simulator.
+    """Train the learned simulator of a scene.
 
     Args:
-        folder: where the run keeps its stages and checkpoints.
-        out: where the weights and their manifest go.
-        episodes: random truth episodes around the reference.
+        scene: what is simulated; human_ball is the kick's.
+        folder: where the run keeps its stages and checkpoints; runs/train/SCENE by default.
+        out: where the weights and their manifest go; a folder of the run's by default.
+        episodes: random truth episodes.
         tasks: kicks planned for the candidates of each stage that adds some.
         effort: multiplies the updates of every stage.
         seed: of the data and the training; the benchmarks use seeds below 100.
     """
-    console = Console()
+    console, chosen = Console(), scenario(scene)
+    folder = folder or Path("runs/train") / chosen.name
     remember_compilations()
-    kick = prepare()
-    scene, config = kick.scene, networks.COMPACT
-    random = stored_episodes(
-        folder / "random.npz", scene, lambda: random_episodes(scene, kick.reference, episodes, seed), console
-    )
-    impacts = stored_episodes(
-        folder / "contacts.npz", scene, lambda: contact_episodes(scene, random, 2 * episodes, seed + 1), console
-    )
-    sources = [random, impacts]
+    kick = prepare() if chosen.name == WEIGHTS else None
+    stages = GENERAL if kick is None else KICK
+    config = networks.COMPACT
+    random = stored_episodes(folder / "random.npz", chosen.scene, lambda: chosen.draw(episodes, seed), console)
+    sources = [random]
+    if chosen.strikes:
+        near = partial(contact_episodes, chosen.scene, random, 2 * episodes, seed + 1)
+        sources.append(stored_episodes(folder / "contacts.npz", chosen.scene, near, console))
     learned: Weights | None = None
     rounds: list[dict[str, Any]] = []
     manifest = Path()
-    for number, stage in enumerate(STAGES):
-        if stage.adds:
+    for number, stage in enumerate(stages):
+        if stage.adds and kick is not None:
+            later = seed + 1000 * number
             makers = {
-                "planned": partial(planned_episodes, kick, manifest, tasks, 8, seed + 1000 * number),
-                "contacts": partial(on_policy_contacts, scene, random, sources[-1], 2 * episodes, seed + 1000 * number),
+                "planned": partial(planned_episodes, kick, manifest, tasks, 8, later),
+                "contacts": partial(on_policy_contacts, chosen.scene, random, sources[-1], 2 * episodes, later),
             }
-            sources.append(stored_episodes(folder / f"{stage.name}.npz", scene, makers[stage.adds], console))
-        manifest = folder / stage.name / f"{WEIGHTS}.json"
+            path = folder / f"{stage.name}.npz"
+            sources.append(stored_episodes(path, chosen.scene, makers[stage.adds], console))
+        manifest = folder / stage.name / f"{chosen.name}.json"
         if manifest.exists():
-            _, learned, content = stored.load(manifest, scene)
+            _, learned, content = stored.load(manifest, chosen.scene)
             rounds = content["recipe"]["rounds"]
             continue
         longest = max(steps for steps, _ in stage.recipe.curriculum)
         used = [(source, 1.0) for source in sources if source.steps >= longest]
         updates = max(1, round(effort * stage.recipe.updates))
         recipe = replace(stage.recipe, updates=updates, seed=seed + number)
-        learned, log = training.train(scene, config, recipe, used, folder / stage.name, learned)
+        learned, log = training.train(chosen.scene, config, recipe, used, folder / stage.name, learned)
         rounds = [
             *rounds,
             {
@@ -180,19 +187,20 @@ def main(
                 "last": log["history"][-1] if log["history"] else None,
             },
         ]
-        stored.save(folder / stage.name, WEIGHTS, scene, config, learned, {"rounds": rounds})
+        stored.save(folder / stage.name, chosen.name, chosen.scene, config, learned, {"rounds": rounds})
         console.print(f"{stage.name}: {log['seconds']:.0f} s, {log['dropped']} batches dropped")
     assert learned is not None
-    held_out, _ = random_episodes(scene, kick.reference, 256, EVALUATION_SEED)
-    scores = evaluation.evaluate(Simulator(scene, config, learned), held_out, WINDOWS)
+    held_out, _ = chosen.draw(256, EVALUATION_SEED)
+    scores = evaluation.evaluate(Simulator(chosen.scene, config, learned), held_out, chosen.windows)
     recipe_of = {
         "rounds": rounds,
-        "truth": {"engine": "mujoco", "substeps": SUBSTEPS, "dt": scene.dt},
+        "truth": {"engine": "mujoco", "substeps": SUBSTEPS, "dt": chosen.scene.dt},
         "hardware": f"{platform.machine()}, {os.cpu_count()} cores, jax {jax.__version__} on {jax.default_backend()}",
         "scores": {"seed": EVALUATION_SEED, **scores},
     }
     console.print_json(json.dumps(scores))
-    console.print(f"weights: {stored.save(out, WEIGHTS, scene, config, learned, recipe_of)}")
+    written = stored.save(out or folder / "weights", chosen.name, chosen.scene, config, learned, recipe_of)
+    console.print(f"weights: {written}")
 
 
 if __name__ == "__main__":

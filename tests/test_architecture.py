@@ -56,6 +56,8 @@ ORDER = [
     "tasks.tracking",
     "tasks.references",
     "tasks.data",
+    "tasks.thrown",
+    "tasks.scenarios",
     "tasks.residuals",
     "tasks.presets",
     "tasks.standing",

@@ -187,6 +187,13 @@ class Truth:
         return result, finite(result)
 
 
+def closed(scene: Scene, states: np.ndarray) -> np.ndarray:
+    """States (N, L, 13) whose joints come together: links that are not roots are put where their joints hold them."""
+    truth = Truth(scene, len(states))
+    truth.reset(states)
+    return truth.state()
+
+
 def finite(states: np.ndarray) -> np.ndarray:
     """(N,) which of the trajectories (N, H, L, 13) stayed finite and within physical limits."""
     near = (np.abs(states[..., packed.POSITION]) < FARTHEST).all(axis=(1, 2, 3))

@@ -1,0 +1,70 @@
+"""The scenes that the simulator is trained and judged on, by name: the kick's, and the paper's diagnostic ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+from larp_model.bodies import chain, human_and_ball, human_and_capsule, two_balls, two_chains
+from larp_model.scene import Scene
+from larp_model.truth.episodes import Episodes
+from tasks import references
+from tasks.data import WINDOWS, random_episodes
+from tasks.thrown import thrown_episodes
+
+CHAIN_WINDOWS = (10, 40, 80, 190)
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A scene, how its truth is drawn, and what the paper reaches there.
+
+    draw: episodes from (count, seed), and how many more diverged. windows: the first n steps over which errors are
+    averaged. strikes: a human meets what lies there; `data.contact_episodes` are worth drawing besides. paper: mean
+    position error [m] over the windows, by body.
+    """
+
+    name: str
+    scene: Scene
+    draw: Callable[[int, int], tuple[Episodes, int]]
+    windows: tuple[int, ...]
+    strikes: bool = False
+    paper: tuple[tuple[str, tuple[float, ...]], ...] = ()
+
+
+def _around_the_kick(scene: Scene, count: int, seed: int) -> tuple[Episodes, int]:
+    return random_episodes(scene, references.embedded(human_and_ball()), count, seed)
+
+
+def _human(name: str, scene: Scene, *paper: tuple[str, tuple[float, ...]]) -> Scenario:
+    return Scenario(name, scene, partial(_around_the_kick, scene), WINDOWS, bool(scene.pairs), paper)
+
+
+def _thrown(name: str, scene: Scene, *paper: float) -> Scenario:
+    known = tuple((body.name, paper) for body in scene.bodies if paper)
+    return Scenario(name, scene, partial(thrown_episodes, scene), CHAIN_WINDOWS, paper=known)
+
+
+# The paper's tables 1 and 2.
+SCENARIOS = {
+    each.name: each
+    for each in (
+        _human("human_ball", human_and_ball(), ("human", (0.010, 0.031, 0.048)), ("ball", (0.006, 0.033, 0.061))),
+        _human(
+            "human_capsule", human_and_capsule(), ("human", (0.010, 0.031, 0.050)), ("capsule", (0.010, 0.042, 0.069))
+        ),
+        _human("human", human_and_ball().only("human")),
+        _thrown("chain4", Scene((chain(links=4),))),
+        _thrown("chains1", two_chains(1), 0.008, 0.021, 0.048, 0.173),
+        _thrown("chains2", two_chains(2), 0.007, 0.023, 0.047, 0.137),
+        _thrown("two_balls", two_balls()),
+    )
+}
+
+
+def scenario(name: str) -> Scenario:
+    """The scenario of that name."""
+    if name not in SCENARIOS:
+        raise ValueError(f"scene is {name!r}, but must be one of {', '.join(SCENARIOS)}")
+    return SCENARIOS[name]

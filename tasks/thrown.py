@@ -1,0 +1,66 @@
+"""Truth episodes of bodies without motors that are thrown: they tumble, fall, and meet if there are several."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from larp_model import state as packed
+from larp_model.scene import Scene
+from larp_model.truth.episodes import Episodes, record
+from larp_model.truth.mujoco import Truth, closed
+from tasks.data import overlaps, resting
+
+STEPS = 200
+# Bodies meet so long after the start [s], so high above the ground [m], so far off each other's middle [m].
+MEETING, HEIGHT, ASIDE = (0.1, 0.6), (0.3, 1.2), 0.1
+# Standard deviations: velocities along the ground and upwards [m/s], spin [rad/s], bend of a joint [rad].
+SPEED, RISING, SPIN, BEND = 1.5, 0.5, 2.0, 0.4
+# Torque on the first link of each body, standard deviation [N m], for so many steps.
+TORQUE, TURNED = 0.5, 10
+
+
+def thrown_starts(random: np.random.Generator, scene: Scene, count: int) -> np.ndarray:
+    """States (count, L, 13) of bodies on their ways to one place, above the ground, joints closed."""
+    states = np.zeros((count, len(scene.links), packed.SIZE))
+    time, height = random.uniform(*MEETING, (count, 1)), random.uniform(*HEIGHT, count)
+    for body in scene.bodies:
+        rows = scene.rows(body.name)
+        turned = [Rotation.from_quat(random.standard_normal((count, 4)))]
+        for joint in body.joints:
+            turned.append(turned[joint.parent] * Rotation.from_rotvec(BEND * random.standard_normal((count, 3))))
+        states[:, rows, packed.ORIENTATION] = np.stack([each.as_quat(scalar_first=True) for each in turned], axis=1)
+        velocity = random.standard_normal((count, 3)) * (SPEED, SPEED, RISING)
+        velocity[:, 2] += 0.5 * scene.gravity * time[:, 0]  # as high when they meet as at the start
+        states[:, rows, packed.VELOCITY] = velocity[:, None]
+        spin = SPIN * random.standard_normal((count, 1, 3))
+        states[:, rows, packed.ANGULAR_VELOCITY] = spin + 0.5 * SPIN * random.standard_normal(
+            (count, len(body.links), 3)
+        )
+        place = ASIDE * random.standard_normal((count, 3)) - velocity * time
+        place[:, 2] += height + 0.5 * scene.gravity * time[:, 0] ** 2
+        states[:, rows.start, packed.POSITION] = place
+    states = closed(scene, states)
+    # A body that starts in the ground is lifted out of it.
+    for body in scene.bodies:
+        rows = scene.rows(body.name)
+        above = [states[:, row, 2] - resting(scene.links[row], states[:, row]) for row in range(rows.start, rows.stop)]
+        states[:, rows, 2] -= np.minimum(np.min(above, axis=0), 0.0)[:, None]
+    return states
+
+
+def thrown_episodes(scene: Scene, count: int, seed: int, steps: int = STEPS) -> tuple[Episodes, int]:
+    """Episodes from `thrown_starts`, the first link of every chain turned by a torque at first.
+
+    Returns them and how many diverged and were dropped.
+    """
+    random = np.random.default_rng(seed)
+    states = thrown_starts(random, scene, 2 * count)
+    states = states[~overlaps(scene, states)][:count] if scene.pairs else states[:count]
+    torques = np.zeros((len(states), steps, len(scene.links), 3))
+    for body in scene.bodies:
+        if body.joints:
+            torque = TORQUE * random.standard_normal((len(states), 1, 3))
+            torques[:, :TURNED, scene.rows(body.name).start] = torque
+    controls = np.zeros((len(states), steps, 0, 3))
+    return record(Truth(scene, batch=min(count, 256)), states, controls, torques)

@@ -1,0 +1,94 @@
+"""The scenes to learn and judge on: what their truth promises, and the one way from a name to weights and scores."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from larp_model import features
+from larp_model import state as packed
+from larp_model import weights as stored
+from larp_model.training import first_contacts
+from larp_model.truth.episodes import Episodes
+from tasks import train
+from tasks.benchmarks import model
+from tasks.data import overlaps, resting
+from tasks.scenarios import SCENARIOS, scenario
+
+COUNT = 32
+
+
+@pytest.fixture(scope="module", params=list(SCENARIOS))
+def drawn(request: pytest.FixtureRequest) -> tuple[str, Episodes]:
+    """A scene's name and some of its episodes."""
+    name = str(request.param)
+    episodes, diverged = SCENARIOS[name].draw(COUNT, 5)
+    assert len(episodes.states) == COUNT - diverged
+    return name, episodes
+
+
+def test_episodes_are_sound_and_reach_the_longest_window(drawn: tuple[str, Episodes]) -> None:
+    name, episodes = drawn
+    assert packed.healthy(episodes.states).all() and len(episodes.states) > 0.9 * COUNT
+    assert episodes.steps >= max(SCENARIOS[name].windows)
+    assert episodes.states.shape[2] == len(SCENARIOS[name].scene.links)
+
+
+def test_joints_hold_in_the_truth(drawn: tuple[str, Episodes]) -> None:
+    scene = SCENARIOS[drawn[0]].scene
+    apart = features.displacement(scene, jnp.asarray(drawn[1].states), features.morphology(scene))
+    assert np.abs(apart).max(initial=0.0) < 2e-6
+
+
+def test_nothing_starts_in_the_ground_or_in_another_body(drawn: tuple[str, Episodes]) -> None:
+    scene, start = SCENARIOS[drawn[0]].scene, drawn[1].states[:, 0]
+    human = scene.rows("human") if drawn[0].startswith("human") else slice(0, 0)  # who stands on it, or leans
+    above = [start[:, row, 2] - resting(link, start[:, row]) for row, link in enumerate(scene.links)]
+    free = [row for row in range(len(scene.links)) if not human.start <= row < human.stop]
+    assert all(above[row].min() > -1e-5 for row in free)
+    assert not scene.pairs or not overlaps(scene, start).any()
+
+
+def test_bodies_that_can_meet_often_do(drawn: tuple[str, Episodes]) -> None:
+    scene = SCENARIOS[drawn[0]].scene
+    met = (first_contacts(scene, drawn[1].states, chunk=COUNT) >= 0).mean()
+    assert met > 0.3 if scene.pairs else met == 0.0
+
+
+def test_a_seed_draws_the_same_again_and_another_does_not() -> None:
+    draw = SCENARIOS["chain4"].draw
+    first, again, other = draw(4, 1)[0], draw(4, 1)[0], draw(4, 2)[0]
+    np.testing.assert_array_equal(first.states, again.states)
+    assert not np.array_equal(first.states, other.states)
+
+
+def test_chains_are_turned_at_first_and_then_left_alone() -> None:
+    torques = SCENARIOS["chain4"].draw(4, 1)[0].torques
+    assert (torques[:, :10, 0] != 0.0).all() and not torques[:, 10:].any() and not torques[:, :, 1:].any()
+
+
+def test_an_unknown_scene_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match=r"scene is 'robot', but must be one of human_ball, .*chains2"):
+        scenario("robot")
+
+
+def test_weights_that_are_not_shipped_are_refused_with_the_way_to_them(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"python -m tasks.train --scene two_balls"):
+        model.main(scene="two_balls", json=tmp_path / "model.json")
+
+
+def test_a_scene_becomes_weights_and_scores(tmp_path: Path) -> None:
+    train.main(scene="chain4", folder=tmp_path / "run", episodes=64, effort=1e-4)
+    manifest = tmp_path / "run/weights/chain4.json"
+    _, _, content = stored.load(manifest, SCENARIOS["chain4"].scene)
+    assert [each["stage"] for each in content["recipe"]["rounds"]] == ["steps", "rollouts"]
+    model.main(scene="chain4", sequences=16, weights=manifest, json=tmp_path / "model.json")
+    found = json.loads((tmp_path / "model.json").read_text())
+    assert found["windows"].keys() == {"10", "40", "80", "190"}
+    assert found["sequences"] == 16 and set(found["windows"]["10"]) == {"chain"}
+    assert found["launch"] == {}
+    assert (tmp_path / "model.png").stat().st_size > 1000
