@@ -163,6 +163,28 @@ def body_inputs(
     return _flat(turned, *scalars)
 
 
+def inputs_after(body: Body, turn: Array, state: Array, soon: Array, apart: Array, shape: Array, dt: float) -> Array:
+    """Inputs (B, F) of a network that corrects what mechanics says: how links (B, n, 13) are to the ground.
+
+    soon (B, n, 13): with the velocities that they will have. Capsules are seen by their axes alone: how one has rolled
+    about its own changes nothing.
+    """
+    links = len(body.links)
+    position = packed.position(state)
+    axes = jnp.array([link.axis for link in body.links], state.dtype)
+    velocities, ends = ends_on_ground(body, soon, shape, dt)
+    vectors = [
+        position - position[:, :1],
+        _apply(rotation.matrix(packed.orientation(state)), axes),
+        packed.velocity(soon),
+        packed.angular_velocity(soon),
+        apart,
+        velocities,
+    ]
+    turned = rotation.about_z(jnp.concatenate(vectors, axis=1), rotation.opposite(turn)[:, None])
+    return _flat(turned, position[..., 2], jnp.broadcast_to(shape, (len(state), links, 3)), ends)
+
+
 def with_pooled(inputs: Array, turn: Array, pooled: Array) -> Array:
     """Inputs (B, F + 6 n) of a network that also sees the pooled contact features (B, n, 6) of its n links."""
     parts = [pooled[..., :3] / IMPULSE_SCALE[0], pooled[..., 3:] / IMPULSE_SCALE[1]]

@@ -20,7 +20,8 @@ class Config:
     the contact's own directions, which balls take up directly and to which articulated bodies have a network of their
     own, of the contact network's size, that adds to the dynamics network's change. skip: residual connections. aided:
     the networks also see what they would else have to find out from rotations: the torques of the servos and how the
-    ends of the links are to the ground.
+    ends of the links are to the ground. base: the dynamics network of an articulated body adds to nothing, or to what
+    mechanics says of a body that nothing touches.
     """
 
     name: str
@@ -35,6 +36,7 @@ class Config:
     contact: Literal["feature", "impulse"]
     skip: bool
     aided: bool
+    base: Literal["nothing", "mechanics"] = "nothing"
 
     def __post_init__(self) -> None:
         for field in ("layers", "width", "contact_layers", "contact_width", "ball_layers", "ball_width"):
@@ -45,6 +47,7 @@ class Config:
             ("frame", ("world", "heading")),
             ("predict", ("velocity", "change")),
             ("contact", ("feature", "impulse")),
+            ("base", ("nothing", "mechanics")),
         ):
             if getattr(self, field) not in choices:
                 raise ValueError(f"config.{field} is {getattr(self, field)!r}, but must be one of {choices}")
@@ -52,7 +55,10 @@ class Config:
 
 PAPER = Config("paper", 12, 512, 6, 128, 12, 128, "world", "velocity", "feature", skip=False, aided=False)
 COMPACT = Config("compact", 6, 256, 4, 128, 2, 32, "heading", "change", "impulse", skip=True, aided=True)
-CONFIGS = {config.name: config for config in (PAPER, COMPACT)}
+HYBRID = Config(
+    "hybrid", 5, 128, 4, 128, 2, 32, "heading", "change", "impulse", skip=True, aided=True, base="mechanics"
+)
+CONFIGS = {config.name: config for config in (PAPER, COMPACT, HYBRID)}
 
 
 class Perceptron(nn.Module):

@@ -60,6 +60,19 @@ def heading(quaternion: Array) -> Array:
     return jnp.stack([cosine, sine], axis=-1)
 
 
+def course(quaternion: Array, axis: tuple[float, float, float]) -> Array:
+    """Cosine and sine (*, 2) of the direction along the ground of an axis that orientations (*, 4) turn.
+
+    It is undefined where the axis is upright; there it is x and its gradient zero.
+    """
+    turned = jnp.sum(matrix(quaternion) * jnp.asarray(axis, quaternion.dtype), axis=-1)
+    squared = turned[..., 0] ** 2 + turned[..., 1] ** 2
+    upright = squared < 1e-8
+    scale = jnp.where(upright, 1.0, squared) ** -0.5
+    along = jnp.where(upright, 1.0, turned[..., 0] * scale), jnp.where(upright, 0.0, turned[..., 1] * scale)
+    return jnp.stack(along, axis=-1)
+
+
 def about_z(vector: Array, turn: Array) -> Array:
     """Turn vectors (*, 3) about z by the angle of cosine and sine `turn` (*, 2)."""
     cosine, sine = turn[..., 0], turn[..., 1]

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model import contact, features, rotation
+from larp_model import contact, features, mechanics, rotation
 from larp_model import state as packed
 from larp_model.features import Statistics
 from larp_model.networks import Config, Perceptron
@@ -224,12 +224,16 @@ def step(
 
 
 class Seen(NamedTuple):
-    """A body with a dynamics network: its rows in the state, its frame (B, 2) and inputs (B, F)."""
+    """A body with a dynamics network: its rows in the state, its frame (B, 2) and inputs (B, F).
+
+    base (B, 2 or 4, n, 3): what is known of its changes without learning; see `integrate`.
+    """
 
     body: Body
     rows: slice
     turn: Array
     inputs: Array
+    base: Array
 
 
 def articulated(
@@ -242,19 +246,34 @@ def articulated(
         joints = slice(joint, joint + len(body.joints))
         joint += len(body.joints)
         if not by_scalars(config, body):
-            turn = frame(config, state[:, rows])
-            inputs = features.body_inputs(
-                body, turn, state[:, rows], control[:, motors], torque[:, rows], apart[:, joints], shape[:, rows],
-                config.aided, scene.dt,
-            )  # fmt: skip
-            yield Seen(body, rows, turn, inputs)
+            own, targets, turn = state[:, rows], control[:, motors], frame(config, body, state[:, rows])
+            base = jnp.zeros((1, 1, 1, 3), state.dtype)
+            if config.base == "mechanics":
+                free = mechanics.free_motion(
+                    body, own, targets, torque[:, rows], shape[:, rows], scene.gravity, scene.dt
+                )
+                base = known_changes(own, free, scene.dt)
+                soon = packed.pack(packed.position(own), packed.orientation(own), free.velocity, free.spin)
+                inputs = features.inputs_after(body, turn, own, soon, apart[:, joints], shape[:, rows], scene.dt)
+            else:
+                inputs = features.body_inputs(
+                    body, turn, own, targets, torque[:, rows], apart[:, joints], shape[:, rows], config.aided, scene.dt
+                )
+            yield Seen(body, rows, turn, inputs, base)
+
+
+def known_changes(state: Array, free: mechanics.Motion, dt: float) -> Array:
+    """The changes (B, 4, n, 3) with which `integrate` makes of states (B, n, 13) what mechanics says."""
+    velocity, spin = packed.velocity(state), packed.angular_velocity(state)
+    corrections = free.moved - 0.5 * dt * (velocity + free.velocity), free.turned - 0.5 * dt * (spin + free.spin)
+    return jnp.stack([free.velocity - velocity, free.spin - spin, *corrections], axis=1)
 
 
 def dynamics(config: Config, weights: Weights, seen: Seen, inputs: Array) -> Array:
     """The outputs (B, 2 or 4, n, 3) of a body's dynamics network, world frame; see `integrate`."""
     name = dynamics_name(seen.body)
     outputs = evaluate(dynamics_network(config, seen.body), weights, name, inputs)
-    return to_world(weights.outputs[name].restore(bounded(outputs, CHANGE_BOUND)), seen)
+    return seen.base + to_world(weights.outputs[name].restore(bounded(outputs, CHANGE_BOUND)), seen)
 
 
 def response(config: Config, weights: Weights, seen: Seen, pooled: Array) -> Array:
@@ -279,8 +298,10 @@ def moved(scene: Scene, config: Config, state: Array, bodies: list[Seen], change
     return state
 
 
-def frame(config: Config, state: Array) -> Array:
+def frame(config: Config, body: Body, state: Array) -> Array:
     """Cosine and sine (B, 2) of the frame in which a body (B, n, 13) is seen."""
+    if config.base == "mechanics":
+        return rotation.course(packed.orientation(state)[:, 0], body.links[0].axis)
     if config.frame == "heading":
         return rotation.heading(packed.orientation(state)[:, 0])
     return jnp.broadcast_to(jnp.array([1.0, 0.0], state.dtype), (state.shape[0], 2))
@@ -483,7 +504,8 @@ def measure(scene: Scene, config: Config, before: Array, after: Array, control: 
             free = free.at[:, rows].set(before[:, rows])
     for seen in articulated(scene, config, before, control, torque, shape):
         body, rows = seen.body, seen.rows
-        outputs = changes(config, before[:, rows], after[:, rows], scene.dt).reshape(len(before), -1, 3)
+        outputs = changes(config, before[:, rows], after[:, rows], scene.dt) - seen.base
+        outputs = outputs.reshape(len(before), -1, 3)
         outputs = rotation.about_z(outputs, rotation.opposite(seen.turn)[:, None]).reshape(len(before), -1)
         alone = Statistics.of(seen.inputs)
         touched = features.with_pooled_statistics(alone, body)

@@ -64,8 +64,11 @@ IMPACTS = replace(
 # The contact's own networks would pay for that with the ball's velocity, and are not trained with it.
 PRECISE = LOSS._replace(position=100.0, rotation=16.0, far=1e-3)
 RESPONSES = replace(IMPACTS, updates=8000, only=RESPONSE, loss=PRECISE)
-# Of scenes in which nothing is planned: steps, then rollouts of all networks together.
-GENERAL = (Stage("steps", "", STEPS), Stage("rollouts", "", replace(ROLLOUTS, only=())))
+# Over mechanics single steps suffice, where small errors count too.
+OVER_MECHANICS = replace(
+    STEPS, updates=10000, contact_share=0.4, before_contact=5, loss=LOSS._replace(far=0.005, fast=0.02)
+)
+GENERAL = (Stage("steps", "", OVER_MECHANICS),)
 KICK = (
     Stage("steps", "", STEPS),
     Stage("rollouts", "", ROLLOUTS),
@@ -147,7 +150,7 @@ def main(
     remember_compilations()
     kick = prepare() if chosen.name == WEIGHTS else None
     stages = GENERAL if kick is None else KICK
-    config = networks.COMPACT
+    config = networks.COMPACT if kick else networks.HYBRID
     random = stored_episodes(folder / "random.npz", chosen.scene, lambda: chosen.draw(episodes, seed), console)
     sources = [random]
     if chosen.strikes:

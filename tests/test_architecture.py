@@ -18,6 +18,7 @@ ORDER = [
     "larp_model.rotation",
     "larp_model.contact",
     "larp_model.compliance",
+    "larp_model.mechanics",
     "larp_model.features",
     "larp_model.networks",
     "larp_model.simulator",

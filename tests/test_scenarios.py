@@ -85,7 +85,7 @@ def test_a_scene_becomes_weights_and_scores(tmp_path: Path) -> None:
     train.main(scene="chain4", folder=tmp_path / "run", episodes=64, effort=1e-4)
     manifest = tmp_path / "run/weights/chain4.json"
     _, _, content = stored.load(manifest, SCENARIOS["chain4"].scene)
-    assert [each["stage"] for each in content["recipe"]["rounds"]] == ["steps", "rollouts"]
+    assert [each["stage"] for each in content["recipe"]["rounds"]] == ["steps"]
     model.main(scene="chain4", sequences=16, weights=manifest, json=tmp_path / "model.json")
     found = json.loads((tmp_path / "model.json").read_text())
     assert found["windows"].keys() == {"10", "40", "80", "190"}

@@ -1,0 +1,336 @@
+"""One step of a body that nothing touches: a tree of links on ball joints, their servos, gravity, torque from outside.
+
+What physics says of it is not learned: this is the base to which a network adds what is left. The equations are those
+of R. Featherstone's articulated-body algorithm (Rigid Body Dynamics Algorithms (2008), 7.3), with velocities at the end
+of a stage instead of accelerations as unknowns, so that servos and damping are implicit:
+
+    A_i V_i' = P_i + W_i                        link i, under the impulse W_i of its joint
+    V_i' = X_i V_p' + S_i y_i + c_i             its joint lets it turn against its parent p, by y_i [rad/s]
+    S_i^T W_i = T_i - G_i y_i                   and pulls: G = h D + h^2 K + armature
+
+Two stages of length gamma dt make a step of second order that damps what is stiff (R. Alexander, SIAM J. Numerical
+Analysis 14 (1977), "SDIRK2"). Inside, arrays have the batch last, so that small matrices are worked on side by side:
+vectors (n, 3, B), matrices (n, 3, 3, B), n links of one level of the tree.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from larp_model import rotation
+from larp_model import state as packed
+from larp_model.compliance import moments
+from larp_model.scene import Body
+
+GAMMA = 1.0 - math.sqrt(0.5)
+# Share of a joint's displacement that a step takes back (J. Baumgarte, Computer Methods 1 (1972)).
+CLOSING = 0.2
+
+
+class Motion(NamedTuple):
+    """What becomes of a body within a step: (B, n, 3) each, world frame.
+
+    velocity [m/s] and spin [rad/s] at its end; moved [m] and turned [rad] during it.
+    """
+
+    velocity: Array
+    spin: Array
+    moved: Array
+    turned: Array
+
+
+class Inertia(NamedTuple):
+    """Symmetric matrices (n, 6, 6, B) from spins and velocities to their momenta, in blocks (n, 3, 3, B)."""
+
+    turning: Array
+    mixed: Array
+    moving: Array
+
+
+class Push(NamedTuple):
+    """Momenta (n, 3, B) of turning and of moving."""
+
+    turning: Array
+    moving: Array
+
+
+class Level(NamedTuple):
+    """Links as far from the root as each other, and the joints that tie them to their parents.
+
+    rows, parents (n,): in the body. Batch last: child, parent (n, 3, B) [m] from the links' centres to the joint;
+    closing (n, 3, B) [m/s]; pull (n, 3, B) and hold (n, 3, 3, B) are the equations' T and G.
+    """
+
+    rows: np.ndarray
+    parents: np.ndarray
+    child: Array
+    parent: Array
+    closing: Array
+    pull: Array
+    hold: Array
+
+
+def free_motion(
+    body: Body, state: Array, control: Array, torque: Array, morphology: Array, gravity: float, dt: float
+) -> Motion:
+    """How a body in states (B, n, 13) moves on within `dt` [s] if nothing touches it.
+
+    control (B, j, 3) joint targets [rad], torque (B, n, 3) [N m] from outside, morphology (B or 1, n, 3).
+    """
+    h = GAMMA * dt
+    state, targets, outside, sizes = (jnp.moveaxis(each, 0, -1) for each in (state, control, torque, morphology))
+    position, orientation, velocity, spin = (
+        state[:, columns] for columns in (packed.POSITION, packed.ORIENTATION, packed.VELOCITY, packed.ANGULAR_VELOCITY)
+    )
+    child, parent = joint_anchors(body, sizes, turns(orientation))
+    gap = _at_parents(body, position, parent) - (position[1:] + child)
+    down = jnp.array([0.0, 0.0, -gravity], state.dtype)[:, None]
+
+    def stage(turned: Array, velocity: Array, spin: Array) -> tuple[Array, Array]:
+        """Velocities and spins `h` later, of links that have turned by (n, 3, B) [rad] since the step began."""
+        start = turn(orientation, turned)
+        matrices = turns(turn(start, h * spin))
+        inertia = inertias(body, matrices, sizes)
+        momentum, mass = mv(inertia.turning, spin), sizes[:, 2:3]
+        push = Push(momentum + h * (outside - cross(spin, momentum)), mass * (velocity + h * down))
+        anchors = joint_anchors(body, sizes, matrices)
+        pull, hold = servos(body, start, targets, spin, h)
+        inertia, push, anchors, pull, hold = held((inertia, push, anchors, pull, hold))
+        levels = [
+            Level(rows, parents, *(each[rows - 1] for each in (*anchors, CLOSING / dt * gap, pull, hold)))
+            for rows, parents in tree(body)
+        ]
+        return solve(inertia, push, levels)
+
+    ratio = (1.0 - GAMMA) / GAMMA
+
+    def advance(begun: tuple[Array, Array, Array], nothing: None) -> tuple[tuple[Array, Array, Array], Any]:
+        velocity, spin, turned = begun
+        after = stage(turned, velocity, spin)
+        goes_on = velocity + ratio * (after[0] - velocity), spin + ratio * (after[1] - spin)
+        return (*goes_on, (1.0 - GAMMA) * dt * after[1]), after
+
+    _, (velocities, spins) = jax.lax.scan(advance, (velocity, spin, jnp.zeros_like(spin)), length=2)
+    (velocity1, velocity2), (spin1, spin2) = velocities, spins
+    begun = (1.0 - GAMMA) * dt * spin1
+    moved = dt * ((1.0 - GAMMA) * velocity1 + GAMMA * velocity2)
+    return Motion(*(jnp.moveaxis(each, -1, 0) for each in (velocity2, spin2, moved, begun + h * spin2)))
+
+
+def tree(body: Body) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Rows of links and of their parents, level by level from the root's children outwards."""
+    depth = [0]
+    for joint in body.joints:
+        depth.append(depth[joint.parent] + 1)
+    levels = []
+    for level in range(1, max(depth) + 1):
+        rows = np.flatnonzero(np.array(depth) == level)
+        levels.append((rows, np.array([body.joints[row - 1].parent for row in rows])))
+    return levels
+
+
+def turn(orientation: Array, rotation_vector: Array) -> Array:
+    """Orientations (n, 4, B) turned by rotation vectors (n, 3, B) [rad], right to the second order."""
+    w, v = orientation[:, :1], orientation[:, 1:]
+    half = 0.5 * rotation_vector
+    real = w - _dot(half, v)
+    imaginary = v + w * half + cross(half, v)
+    scale = (real**2 + _dot(imaginary, imaginary)) ** -0.5
+    return scale * jnp.concatenate([real, imaginary], axis=1)
+
+
+def turns(orientation: Array) -> Array:
+    """Rotation matrices (n, 3, 3, B) of orientations (n, 4, B)."""
+    w, x, y, z = (orientation[:, k] for k in range(4))
+    rows = (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+    return jnp.stack([jnp.stack(row, axis=1) for row in rows], axis=1)
+
+
+def angles(parent: Array, child: Array) -> Array:
+    """Rotation vectors (n, 3, B) [rad] of children against their parents, from their orientations (n, 4, B)."""
+    w, v, a, u = parent[:, :1], parent[:, 1:], child[:, :1], child[:, 1:]
+    relative = jnp.concatenate([w * a + _dot(v, u), w * u - a * v - cross(v, u)], axis=1)
+    return jnp.moveaxis(rotation.to_rotation_vector(jnp.moveaxis(relative, 1, -1)), -1, 1)
+
+
+def _dot(first: Array, second: Array) -> Array:
+    x, y, z = (first[:, k : k + 1] * second[:, k : k + 1] for k in range(3))
+    return x + y + z
+
+
+def joint_anchors(body: Body, sizes: Array, matrices: Array) -> tuple[Array, Array]:
+    """Where joints are from the centres of their children and of their parents, (n - 1, 3, B) [m] each."""
+
+    def place(rows: list[int], points: list[tuple[float, float, float]]) -> Array:
+        axis = np.array([body.links[row].axis for row in rows], np.float32).reshape(-1, 3)
+        point = np.array(points, np.float32).reshape(-1, 3)
+        along = np.sum(axis * point, axis=-1, keepdims=True) * axis
+        local = 0.5 * sizes[rows, 0:1] * along[..., None] + sizes[rows, 1:2] * (point - along)[..., None]
+        return mv(matrices[np.array(rows, int)], local)
+
+    children = list(range(1, len(body.links)))
+    return (
+        place(children, [joint.child_anchor for joint in body.joints]),
+        place([joint.parent for joint in body.joints], [joint.parent_anchor for joint in body.joints]),
+    )
+
+
+def _at_parents(body: Body, position: Array, offset: Array) -> Array:
+    return position[np.array([joint.parent for joint in body.joints], int)] + offset
+
+
+def inertias(body: Body, matrices: Array, sizes: Array) -> Inertia:
+    """Of the links alone, in world axes."""
+    along, across = moments(sizes[:, 0], sizes[:, 1], sizes[:, 2])
+    axes = np.array([link.axis for link in body.links], np.float32)
+    axis = mv(matrices, jnp.asarray(axes, matrices.dtype)[..., None])
+    outer = axis[:, :, None] * axis[:, None, :]
+    unit = jnp.eye(3, dtype=matrices.dtype)[..., None]
+    turning = across[:, None, None] * unit + (along - across)[:, None, None] * outer
+    moving = jnp.broadcast_to(sizes[:, 2][:, None, None] * unit, turning.shape)
+    return Inertia(turning, jnp.zeros_like(turning), moving)
+
+
+def servos(body: Body, orientation: Array, targets: Array, spin: Array, h: float) -> tuple[Array, Array]:
+    """Pull (n - 1, 3, B) and hold (n - 1, 3, 3, B) of all joints within `h` [s]; see the module's equations.
+
+    orientation (n, 4, B), targets (j, 3, B) [rad], spin (n, 3, B). A servo that is at its limit pulls on, and yields.
+    """
+    links, batch = len(body.links), spin.shape[-1]
+    stiffness, limit, armature, damping = np.zeros((4, links - 1, 1, 1), np.float32)
+    aim, motor_rows = jnp.zeros((links - 1, 3, batch), spin.dtype), []
+    for child, joint in enumerate(body.joints):
+        motor = joint.motor
+        damping[child] = joint.damping if motor is None else motor.damping
+        if motor is not None:
+            stiffness[child], limit[child], armature[child] = motor.stiffness, motor.torque_limit, motor.armature
+            motor_rows.append(child)
+    parents = np.array([joint.parent for joint in body.joints], int)
+    matrices = turns(orientation[1:])
+    unit = jnp.eye(3, dtype=spin.dtype)[..., None]
+    free = jnp.asarray(armature + h * damping, spin.dtype)
+    pull = jnp.asarray(armature, spin.dtype) * (spin[1:] - spin[parents])
+    if not motor_rows:
+        return pull, jnp.broadcast_to(free[..., None] * unit, (links - 1, 3, 3, batch))
+    aim = aim.at[np.array(motor_rows)].set(targets)
+    wanted = stiffness * (aim - angles(orientation[parents], orientation[1:]))
+    giving = h**2 * stiffness * (jnp.abs(wanted) < limit)
+    hold = mm(matrices * giving[:, None], jnp.swapaxes(matrices, 1, 2)) + free[..., None] * unit
+    return pull + h * mv(matrices, jnp.clip(wanted, -limit, limit)), hold
+
+
+def solve(inertia: Inertia, push: Push, levels: list[Level]) -> tuple[Array, Array]:
+    """Velocities and spins (n, 3, B) with which links part under their pushes and their joints' impulses."""
+    passed = []
+    for level in reversed(levels):
+        own = Inertia(*(block[level.rows] for block in inertia))
+        moved = Push(*(each[level.rows] for each in push))
+        moved = Push(moved.turning - mv(own.mixed, level.closing), moved.moving - mv(own.moving, level.closing))
+        # A S, and S' A S + G
+        across = own.turning + cross_rows(own.mixed, level.child)
+        along = jnp.swapaxes(own.mixed, 1, 2) + cross_rows(own.moving, level.child)
+        across, along, moved = held((across, along, moved))
+        give = held(invert(across - cross_columns(level.child, along) + level.hold))
+        turned = mv(give, level.pull + moved.turning - cross(level.child, moved.moving))
+        to_turn, to_move = (mm(give, jnp.swapaxes(each, 1, 2)) for each in (across, along))
+        turned, to_turn, to_move = held((turned, to_turn, to_move))
+        passed.append((turned, to_turn, to_move))
+        # What the joint hands on: A - A S (S' A S + G)^-1 S' A, seen from the parent's centre
+        turning, mixed, moving = (
+            own.turning - mm(across, to_turn),
+            own.mixed - mm(across, to_move),
+            own.moving - mm(along, to_move),
+        )
+        handed = Push(moved.turning - mv(across, turned), moved.moving - mv(along, turned))
+        turning, mixed, moving, handed = held((turning, mixed, moving, handed))
+        arm = level.child - level.parent
+        reaching = jnp.swapaxes(mixed, 1, 2) + cross_rows(moving, arm)
+        onto = Inertia(
+            turning + cross_rows(mixed, arm) - cross_columns(arm, reaching), mixed - cross_columns(arm, moving), moving
+        )
+        inertia = Inertia(*(_added(a, b, level.parents) for a, b in zip(inertia, onto, strict=True)))
+        handed = Push(handed.turning - cross(arm, handed.moving), handed.moving)
+        push = Push(*(_added(a, b, level.parents) for a, b in zip(push, handed, strict=True)))
+        inertia, push = held((inertia, push))
+    spin, velocity = _root(Inertia(*(block[:1] for block in inertia)), Push(*(each[:1] for each in push)))
+    rows = np.array([0])
+    for level, (turned, to_turn, to_move) in zip(levels, reversed(passed), strict=True):
+        above = np.array([int(np.flatnonzero(rows == parent)[0]) for parent in level.parents])
+        turning, moving = spin[above], velocity[above]
+        arm = level.child - level.parent
+        carried = moving + cross(arm, turning)
+        relative = turned - mv(to_turn, turning) - mv(to_move, carried)
+        rows = np.concatenate([rows, level.rows])
+        spin = jnp.concatenate([spin, turning + relative])
+        velocity = jnp.concatenate([velocity, carried + cross(level.child, relative) + level.closing])
+    order = np.argsort(rows)
+    return velocity[order], spin[order]
+
+
+def _added(whole: Array, parts: Array, rows: np.ndarray) -> Array:
+    """The whole (n, ...) with parts added to its rows, in which one may come more than once."""
+    return jnp.stack([sum((parts[i] for i in np.flatnonzero(rows == row)), whole[row]) for row in range(len(whole))])
+
+
+def _root(inertia: Inertia, push: Push) -> tuple[Array, Array]:
+    """Spin and velocity (1, 3, B) of a link without a parent, by the Schur complement of what moves."""
+    still = invert(inertia.moving)
+    lever = mm(inertia.mixed, still)
+    spin = mv(
+        invert(inertia.turning - mm(lever, jnp.swapaxes(inertia.mixed, 1, 2))), push.turning - mv(lever, push.moving)
+    )
+    return spin, mv(still, push.moving - mv(jnp.swapaxes(inertia.mixed, 1, 2), spin))
+
+
+held = jax.lax.optimization_barrier
+# Sums and stacks of slices, for XLA makes one quick loop over the batch of them, and a slow one of a reduction.
+
+
+def mv(matrix: Array, vector: Array) -> Array:
+    """Matrices (n, 3, 3, B) times vectors (n, 3, B)."""
+    a, b, c = (matrix[:, :, k] * vector[:, None, k] for k in range(3))
+    return a + b + c
+
+
+def mm(first: Array, second: Array) -> Array:
+    """Products of matrices (n, 3, 3, B)."""
+    a, b, c = (first[:, :, k, None] * second[:, None, k] for k in range(3))
+    return a + b + c
+
+
+def cross(first: Array, second: Array) -> Array:
+    """Of vectors (n, 3, B)."""
+    return _cross(first, second, 1)
+
+
+def cross_columns(vector: Array, matrix: Array) -> Array:
+    """[v] M: each column of M (n, 3, 3, B) crossed from the left with v (n, 3, B)."""
+    return _cross(vector[:, :, None], matrix, 1)
+
+
+def cross_rows(matrix: Array, vector: Array) -> Array:
+    """M [v]: each row of M (n, 3, 3, B) crossed with v (n, 3, B)."""
+    return _cross(matrix, vector[:, None], 2)
+
+
+def _cross(first: Array, second: Array, axis: int) -> Array:
+    (a, b, c), (x, y, z) = (jnp.moveaxis(each, axis, 0) for each in (first, second))
+    return jnp.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=axis)
+
+
+def invert(matrix: Array) -> Array:
+    """Inverses of regular matrices (n, 3, 3, B), by their adjugates."""
+    a, b, c = matrix[:, 0], matrix[:, 1], matrix[:, 2]
+    adjugate = jnp.stack([cross(b, c), cross(c, a), cross(a, b)], axis=2)
+    x, y, z = (a[:, k] * adjugate[:, k, 0] for k in range(3))
+    return adjugate / (x + y + z)[:, None, None]

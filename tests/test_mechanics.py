@@ -1,0 +1,193 @@
+"""Mechanics of bodies that nothing touches: conservation, order, agreement with the engine, symmetry, gradients."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import Array
+
+from larp_model import features, rotation
+from larp_model import state as packed
+from larp_model.bodies import capsule, chain, human
+from larp_model.compliance import moments
+from larp_model.mechanics import CLOSING, Motion, free_motion
+from larp_model.scene import Body, Scene
+from larp_model.truth.mujoco import Truth, closed
+
+BODIES = (capsule(), chain(links=2), chain(links=4), human())
+COUNT, HIGH = 16, 10.0
+
+
+@pytest.fixture(autouse=True)
+def double_precision() -> Iterator[None]:
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(params=BODIES, ids=[body.kind for body in BODIES])
+def body(request: pytest.FixtureRequest) -> Body:
+    found: Body = request.param
+    return found
+
+
+@cache
+def starts(body: Body) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States (16, n, 13) high above the ground, joints closed, with controls and torques from outside."""
+    random = np.random.default_rng(0)
+    links = len(body.links)
+    states = np.zeros((COUNT, links, packed.SIZE))
+    turned = random.standard_normal((COUNT, 1, 4)) + 0.2 * random.standard_normal((COUNT, links, 4))
+    states[..., packed.ORIENTATION] = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
+    states[..., packed.VELOCITY] = random.standard_normal((COUNT, 1, 3))
+    states[..., packed.ANGULAR_VELOCITY] = 2.0 * random.standard_normal((COUNT, links, 3))
+    states[..., 2] = HIGH
+    controls = 0.3 * random.standard_normal((COUNT, len(body.motors), 3))
+    return closed(Scene((body,)), states), controls, 0.5 * random.standard_normal((COUNT, links, 3))
+
+
+def motion_of(
+    body: Body, state: Array, control: Array, torque: Array, gravity: float = 9.81, dt: float = 0.01
+) -> Motion:
+    """`free_motion` of the body as it is."""
+    return free_motion(body, state, control, torque, features.morphology(Scene((body,)))[None], gravity, dt)
+
+
+@cache
+def compiled(body: Body) -> Any:
+    """`motion_of` the body, compiled once for every gravity and step."""
+    options = {"xla_backend_optimization_level": 0}
+    found = jax.jit(partial(motion_of, body), compiler_options=options)
+    return lambda *given, gravity=9.81, dt=0.01: found(*given, gravity, dt)
+
+
+def moved(states: np.ndarray, motion: Motion) -> np.ndarray:
+    """States (N, n, 13) after a motion."""
+    turned = rotation.integrate(jnp.asarray(states[..., packed.ORIENTATION]), motion.turned)
+    return np.asarray(packed.pack(jnp.asarray(states[..., :3]) + motion.moved, turned, motion.velocity, motion.spin))
+
+
+def momenta(body: Body, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Momentum [kg m/s] and angular momentum [kg m^2/s] about the origin, (N, 3) each."""
+    shape = np.asarray(features.morphology(Scene((body,))), float)
+    along, across = (np.asarray(each)[:, None] for each in moments(*shape.T))
+    matrices = np.asarray(rotation.matrix(jnp.asarray(states[..., packed.ORIENTATION])))
+    axis = np.einsum("nlij,lj->nli", matrices, np.array([link.axis for link in body.links]))
+    spin = states[..., packed.ANGULAR_VELOCITY]
+    own = across * spin + (along - across) * np.sum(axis * spin, axis=-1, keepdims=True) * axis
+    momentum = shape[:, 2:] * states[..., packed.VELOCITY]
+    return momentum.sum(axis=1), (own + np.cross(states[..., :3], momentum)).sum(axis=1)
+
+
+def test_the_centre_of_mass_falls_freely(body: Body) -> None:
+    states, controls, torques = starts(body)
+    after = moved(states, compiled(body)(states, controls, torques))
+    mass = np.array([link.mass for link in body.links])
+    before, later = (np.average(each, axis=1, weights=mass) for each in (states, after))
+    np.testing.assert_allclose(later[:, 7:10], before[:, 7:10] - [0.0, 0.0, 0.0981], atol=2e-6)
+    np.testing.assert_allclose(
+        later[:, :3], before[:, :3] + 0.01 * before[:, 7:10] - [0.0, 0.0, 0.5 * 9.81 * 1e-4], atol=1e-7
+    )
+
+
+def test_momentum_is_kept_where_nothing_pulls(body: Body) -> None:
+    states, controls, torques = starts(body)
+    before = momenta(body, states)
+    for steps in (1, 10):  # joints that come together, and turns by a tenth of a radian, leave the third order
+        dt, after = 0.01 / steps, states
+        for _ in range(steps):
+            after = moved(after, compiled(body)(after, controls, 0.0 * torques, gravity=0.0, dt=dt))
+        found = momenta(body, after)
+        np.testing.assert_allclose(found[0], before[0], atol=1e-4 / steps)
+        scale = np.linalg.norm(before[1] - np.cross(states[:, 0, :3], before[0]), axis=-1).mean()
+        assert np.abs(found[1] - before[1]).max() < 0.02 * scale / steps
+
+
+def test_halving_the_step_leaves_less_than_a_third_of_the_error() -> None:
+    body = chain(links=4)
+    states, controls, torques = starts(body)
+    truth = Truth(Scene((body,)), COUNT, 640)
+    truth.reset(states)
+    true = truth.step(controls, torques)
+
+    def error(steps: int) -> float:
+        after = states
+        for _ in range(steps):
+            after = moved(after, compiled(body)(after, controls, torques, dt=0.01 / steps))
+        return float(np.abs(after - true)[..., 7:].mean())
+
+    assert error(2) < error(1) / 3 and error(4) < error(2) / 3
+
+
+@pytest.mark.parametrize(("body", "share"), [(BODIES[0], 0.05), (BODIES[2], 0.05), (BODIES[3], 0.2)])
+def test_a_step_is_the_engines_but_for_a_share_of_its_change(body: Body, share: float) -> None:
+    states, controls, torques = starts(body)
+    truth = Truth(Scene((body,)), COUNT, 80)
+    truth.reset(states)
+    true = truth.step(controls, torques)
+    motion = compiled(body)(states, controls, torques)
+    for found, columns in ((motion.velocity, packed.VELOCITY), (motion.spin, packed.ANGULAR_VELOCITY)):
+        error = np.linalg.norm(found - true[..., columns], axis=-1)
+        change = np.linalg.norm(true[..., columns] - states[..., columns], axis=-1)
+        assert np.median(error) < share * np.median(change)
+
+
+def test_turning_the_world_turns_the_motion(body: Body) -> None:
+    states, controls, torques = starts(body)
+    angle = jnp.linspace(-3.0, 3.0, COUNT)
+    turn = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+    first = compiled(body)(states, controls, torques)
+    turned = (
+        features.turn_states(jnp.asarray(states), turn),
+        controls,
+        rotation.about_z(jnp.asarray(torques), turn[:, None]),
+    )
+    for one, other in zip(first, compiled(body)(*turned), strict=True):
+        np.testing.assert_allclose(rotation.about_z(one, turn[:, None]), other, atol=1e-9)
+
+
+@pytest.mark.parametrize("body", BODIES[1:], ids=[body.kind for body in BODIES[1:]])
+def test_a_joint_that_came_apart_closes_by_its_share(body: Body) -> None:
+    states, controls, torques = starts(body)
+    scene = Scene((body,))
+    open_ = states.copy()
+    open_[:, 1:, 0] += 1e-3 * np.arange(1, len(body.links))
+
+    def gaps(found: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(features.displacement(scene, jnp.asarray(found), features.morphology(scene)), axis=-1)
+
+    after = moved(open_, compiled(body)(open_, controls, torques))
+    before = gaps(open_)
+    assert before.min() > 5e-4
+    np.testing.assert_allclose(gaps(after).sum() / before.sum(), 1.0 - CLOSING, atol=0.02)
+
+
+def test_stiff_servos_do_not_throw_a_body_in_long_steps() -> None:
+    body = human()
+    states, _, torques = starts(body)
+    controls = np.zeros((COUNT, len(body.motors), 3))
+    for _ in range(40):
+        states = moved(states, compiled(body)(states, controls, 0.0 * torques, dt=0.05))
+    assert np.isfinite(states).all() and np.abs(states[..., packed.ANGULAR_VELOCITY]).max() < 30.0
+
+
+def test_forward_reverse_and_finite_difference_gradients_agree() -> None:
+    body = chain(links=2)
+    states, controls, torques = (each[:1] for each in starts(body))
+    given = np.concatenate([states.ravel(), torques.ravel()])
+
+    def after(given: Array) -> Array:
+        state, torque = given[: states.size].reshape(states.shape), given[states.size :].reshape(torques.shape)
+        return jnp.concatenate(motion_of(body, state, jnp.asarray(controls), torque), axis=-1).ravel()
+
+    options = {"xla_backend_optimization_level": 0}
+    forward, reverse = (jax.jit(way(after), compiler_options=options)(given) for way in (jax.jacfwd, jax.jacrev))
+    np.testing.assert_allclose(forward, reverse, atol=1e-9)
+    step = 1e-6 * np.eye(len(given))
+    several = jax.jit(jax.vmap(after), compiler_options=options)
+    np.testing.assert_allclose((several(given + step) - several(given - step)).T / 2e-6, forward, atol=1e-5)
