@@ -1,4 +1,4 @@
-"""One step of a body that nothing touches: a tree of links on ball joints, their servos, gravity, torque from outside.
+"""One step of a body alone: a tree of links on ball joints, their servos, gravity, torque from outside, the ground.
 
 What physics says of it is not learned: this is the base to which a network adds what is left. The equations are those
 of R. Featherstone's articulated-body algorithm (Rigid Body Dynamics Algorithms (2008), 7.3), with velocities at the end
@@ -16,7 +16,7 @@ vectors (n, 3, B), matrices (n, 3, 3, B), n links of one level of the tree.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,9 @@ from larp_model.scene import Body
 GAMMA = 1.0 - math.sqrt(0.5)
 # Share of a joint's displacement that a step takes back (J. Baumgarte, Computer Methods 1 (1972)).
 CLOSING = 0.2
+# An end that stands on the ground is held as if by so many times its body's mass, one that slides by so many: held
+# harder, a direction of sliding that is half a step old throws the body.
+HELD_BY, HELD_LOOSELY_BY = 8.0, 0.2
 
 
 class Motion(NamedTuple):
@@ -60,6 +63,10 @@ class Push(NamedTuple):
     moving: Array
 
 
+Begun = tuple[Array, Array, Array, Array]
+"""What a stage starts from: see `free_motion`."""
+
+
 class Level(NamedTuple):
     """Links as far from the root as each other, and the joints that tie them to their parents.
 
@@ -79,7 +86,7 @@ class Level(NamedTuple):
 def free_motion(
     body: Body, state: Array, control: Array, torque: Array, morphology: Array, gravity: float, dt: float
 ) -> Motion:
-    """How a body in states (B, n, 13) moves on within `dt` [s] if nothing touches it.
+    """How a body in states (B, n, 13) moves on within `dt` [s] if nothing but the ground touches it.
 
     control (B, j, 3) joint targets [rad], torque (B, n, 3) [N m] from outside, morphology (B or 1, n, 3).
     """
@@ -92,8 +99,8 @@ def free_motion(
     gap = _at_parents(body, position, parent) - (position[1:] + child)
     down = jnp.array([0.0, 0.0, -gravity], state.dtype)[:, None]
 
-    def stage(turned: Array, velocity: Array, spin: Array) -> tuple[Array, Array]:
-        """Velocities and spins `h` later, of links that have turned by (n, 3, B) [rad] since the step began."""
+    def stage(raised: Array, turned: Array, velocity: Array, spin: Array) -> tuple[Array, Array]:
+        """Velocities and spins `h` later, of links raised by (n, 1, B) [m] and turned by (n, 3, B) [rad] before."""
         start = turn(orientation, turned)
         matrices = turns(turn(start, h * spin))
         inertia = inertias(body, matrices, sizes)
@@ -101,6 +108,8 @@ def free_motion(
         push = Push(momentum + h * (outside - cross(spin, momentum)), mass * (velocity + h * down))
         anchors = joint_anchors(body, sizes, matrices)
         pull, hold = servos(body, start, targets, spin, h)
+        bearing = ground(body, turns(start), position[:, 2:] + raised, velocity, spin, sizes, gravity, h)
+        inertia, push = jax.tree.map(jnp.add, (inertia, push), bearing)
         inertia, push, anchors, pull, hold = held((inertia, push, anchors, pull, hold))
         levels = [
             Level(rows, parents, *(each[rows - 1] for each in (*anchors, CLOSING / dt * gap, pull, hold)))
@@ -110,13 +119,15 @@ def free_motion(
 
     ratio = (1.0 - GAMMA) / GAMMA
 
-    def advance(begun: tuple[Array, Array, Array], nothing: None) -> tuple[tuple[Array, Array, Array], Any]:
-        velocity, spin, turned = begun
-        after = stage(turned, velocity, spin)
+    def advance(begun: Begun, nothing: None) -> tuple[Begun, tuple[Array, Array]]:
+        raised, turned, velocity, spin = begun
+        after = stage(raised, turned, velocity, spin)
+        late = (1.0 - GAMMA) * dt
         goes_on = velocity + ratio * (after[0] - velocity), spin + ratio * (after[1] - spin)
-        return (*goes_on, (1.0 - GAMMA) * dt * after[1]), after
+        return (late * after[0][:, 2:], late * after[1], *goes_on), after
 
-    _, (velocities, spins) = jax.lax.scan(advance, (velocity, spin, jnp.zeros_like(spin)), length=2)
+    still = jnp.zeros_like(spin)
+    _, (velocities, spins) = jax.lax.scan(advance, (still[:, 2:], still, velocity, spin), length=2)
     (velocity1, velocity2), (spin1, spin2) = velocities, spins
     begun = (1.0 - GAMMA) * dt * spin1
     moved = dt * ((1.0 - GAMMA) * velocity1 + GAMMA * velocity2)
@@ -227,6 +238,47 @@ def servos(body: Body, orientation: Array, targets: Array, spin: Array, h: float
     giving = h**2 * stiffness * (jnp.abs(wanted) < limit)
     hold = mm(matrices * giving[:, None], jnp.swapaxes(matrices, 1, 2)) + free[..., None] * unit
     return pull + h * mv(matrices, jnp.clip(wanted, -limit, limit)), hold
+
+
+def ground(
+    body: Body, matrices: Array, height: Array, velocity: Array, spin: Array, sizes: Array, gravity: float, h: float
+) -> tuple[Inertia, Push]:
+    """What the ends of links that touch the ground add to inertia and push within `h` [s].
+
+    matrices (n, 3, 3, B) and height (n, 1, B) [m] of the links. Where an end is in the ground, the damped spring of the
+    body's surface says how fast it is to be, and a large mass that moves so holds it. Friction wants it to stand; what
+    slides is held along the direction of the sliding force alone. Of a body that falls freely it would be a law; where
+    joints pull, the network corrects it.
+    """
+    surface = body.surface
+    axes = jnp.array([link.axis for link in body.links], matrices.dtype)[..., None]
+    half, radius = 0.5 * sizes[:, :1] * mv(matrices, axes), sizes[:, 1:2]
+    mass = jnp.sum(sizes[:, 2:], axis=0, keepdims=True)
+    upright = jnp.array([0.0, 0.0, 1.0], matrices.dtype)[:, None]
+    unit = jnp.eye(3, dtype=matrices.dtype)[..., None]
+    damped = 1.0 + h * surface.damping
+
+    def end(arm: Array) -> tuple[Inertia, Push]:
+        """Of the ends whose lowest points are at `arm` (n, 3, B) [m] from the links' centres."""
+        speed = velocity + cross(spin, arm)
+        clearance, rising = height + arm[:, 2:], speed[:, 2:]
+        falling = rising - h * gravity
+        wanted = (rising - h * surface.stiffness * clearance) / (damped + h**2 * surface.stiffness)
+        pressed = wanted - falling  # the change of speed that the ground makes
+        touching = (clearance + h * falling < 0.0) & (pressed > 0.0)
+        sliding = speed * (1.0 - upright)
+        slip = jnp.sqrt(jnp.sum(sliding**2, axis=1, keepdims=True) + 1e-8)
+        sticks = slip * (damped - 1.0) / damped <= surface.friction * pressed
+        along = upright - surface.friction * sliding / slip
+        loosely = HELD_LOOSELY_BY * along[:, :, None] * along[:, None]
+        hold = (mass * touching)[:, None] * jnp.where(sticks[:, None], HELD_BY * unit, loosely)
+        target = mv(hold, sliding / damped + wanted * upright)
+        mixed = cross_columns(arm, hold)
+        return Inertia(-cross_rows(mixed, arm), mixed, hold), Push(cross(arm, target), target)
+
+    down = radius * upright
+    added: tuple[Inertia, Push] = jax.tree.map(jnp.add, end(half - down), end(-half - down))
+    return added
 
 
 def solve(inertia: Inertia, push: Push, levels: list[Level]) -> tuple[Array, Array]:

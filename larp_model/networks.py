@@ -21,7 +21,7 @@ class Config:
     own, of the contact network's size, that adds to the dynamics network's change. skip: residual connections. aided:
     the networks also see what they would else have to find out from rotations: the torques of the servos and how the
     ends of the links are to the ground. base: the dynamics network of an articulated body adds to nothing, or to what
-    mechanics says of a body that nothing touches.
+    mechanics says of a body alone on the ground.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Mechanics of bodies that nothing touches: conservation, order, agreement with the engine, symmetry, gradients."""
+"""Mechanics of a body alone: conservation, order, agreement with the engine, the ground, symmetry, gradients."""
 
 from __future__ import annotations
 
@@ -11,14 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import Array
+from scipy.spatial.transform import Rotation
 
 from larp_model import features, rotation
 from larp_model import state as packed
-from larp_model.bodies import capsule, chain, human
+from larp_model.bodies import capsule, chain, human, human_and_ball
 from larp_model.compliance import moments
 from larp_model.mechanics import CLOSING, Motion, free_motion
 from larp_model.scene import Body, Scene
 from larp_model.truth.mujoco import Truth, closed
+from tasks.references import standing_on_ground
+from tasks.thrown import thrown_starts
 
 BODIES = (capsule(), chain(links=2), chain(links=4), human())
 COUNT, HIGH = 16, 10.0
@@ -82,6 +85,18 @@ def momenta(body: Body, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     own = across * spin + (along - across) * np.sum(axis * spin, axis=-1, keepdims=True) * axis
     momentum = shape[:, 2:] * states[..., packed.VELOCITY]
     return momentum.sum(axis=1), (own + np.cross(states[..., :3], momentum)).sum(axis=1)
+
+
+def energy(body: Body, states: np.ndarray) -> np.ndarray:
+    """Energy (N,) [J] of motion and height."""
+    length, radius, mass = np.asarray(features.morphology(Scene((body,))), float).T
+    along, across = (np.asarray(each) for each in moments(length, radius, mass))  # type: ignore[arg-type]
+    matrices = np.asarray(rotation.matrix(jnp.asarray(states[..., packed.ORIENTATION])))
+    axis, spin = matrices @ np.array(body.links[0].axis), states[..., packed.ANGULAR_VELOCITY]
+    turning = across * np.sum(spin**2, axis=-1) + (along - across) * np.sum(axis * spin, axis=-1) ** 2
+    moving = mass * (np.sum(states[..., packed.VELOCITY] ** 2, axis=-1) + 2.0 * 9.81 * states[..., 2])
+    found: np.ndarray = 0.5 * np.sum(moving + turning, axis=-1)
+    return found
 
 
 def test_the_centre_of_mass_falls_freely(body: Body) -> None:
@@ -165,6 +180,29 @@ def test_a_joint_that_came_apart_closes_by_its_share(body: Body) -> None:
     before = gaps(open_)
     assert before.min() > 5e-4
     np.testing.assert_allclose(gaps(after).sum() / before.sum(), 1.0 - CLOSING, atol=0.02)
+
+
+def test_a_chain_comes_to_rest_on_the_ground_and_is_given_no_energy() -> None:
+    body = chain(links=4)
+    states = thrown_starts(np.random.default_rng(0), Scene((body,)), COUNT)
+    none = np.zeros((COUNT, 0, 3)), np.zeros((COUNT, len(body.links), 3))
+    most = energy(body, states)
+    for _ in range(300):
+        states = moved(states, compiled(body)(states, *none))
+        assert (energy(body, states) < most + 0.01 * np.abs(most)).all()
+    assert np.abs(states[..., 7:]).max() < 1e-6
+    np.testing.assert_allclose(states[..., 2], body.links[0].radius, atol=2e-4)
+
+
+def test_a_standing_human_presses_on_the_ground_as_in_the_truth() -> None:
+    scene = human_and_ball().only("human")
+    body, stand = scene.bodies[0], np.zeros((1, len(scene.motors), 3))
+    states = standing_on_ground(scene, stand, Rotation.identity(1))
+    true, _ = Truth(scene).rollout(states, np.zeros((1, 20, len(scene.motors), 3)))
+    for _ in range(20):
+        states = moved(states, compiled(body)(states, stand, np.zeros((1, len(body.links), 3))))
+    assert np.abs(states[..., :3] - true[:, -1, :, :3]).max() < 0.01
+    assert np.abs(states[..., 7:10] - true[:, -1, :, 7:10]).max() < 0.1
 
 
 def test_stiff_servos_do_not_throw_a_body_in_long_steps() -> None:
