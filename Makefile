@@ -48,6 +48,7 @@ bench: $(READY)
 	$(RUN) tasks.benchmarks.optimizers --publish
 	$(RUN) tasks.benchmarks.stability --publish
 	$(RUN) tasks.benchmarks.model --scene human_ball --sequences 256 --seed 1 --publish
+	for scene in chains1 chains2 chain4; do $(RUN) tasks.benchmarks.model --publish --scene $$scene --sequences 256 --seed 2 || exit; done
 	$(RUN) tasks.benchmarks.gap --targets 8 --seed 7 --publish
 	for preset in fast balanced accurate; do $(RUN) tasks.benchmarks.kick --publish --targets 64 --seed 11 --preset $$preset || exit; done
 	for preset in fast balanced accurate; do $(KICK) --targets 32 --preset $$preset --substeps 20 || exit; done

@@ -1,0 +1,119 @@
+"""The simulator over mechanics: symmetries, what it sees of a capsule, and the errors of the shipped chains."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from larp_model import evaluation, features, rotation
+from larp_model import state as packed
+from larp_model import weights as stored
+from larp_model.bodies import two_chains
+from larp_model.networks import Config
+from larp_model.simulator import Simulator, rollout
+from larp_model.training import Recipe, Windows, first_contacts, statistics_of
+from tasks.scenarios import scenario
+
+STEPS = 5
+SCENE = two_chains(2)
+TINY = Config("tiny", 2, 16, 2, 16, 2, 16, "heading", "change", "impulse", skip=True, aided=True, base="mechanics")
+SOON = {"xla_backend_optimization_level": 0}
+ROLL = jax.jit(rollout, static_argnums=(0, 1), compiler_options=SOON)
+
+
+@pytest.fixture(autouse=True)
+def double_precision() -> Iterator[None]:
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="module")
+def simulator() -> Simulator:
+    """Two chains with random weights."""
+    with jax.enable_x64(False):
+        episodes, _ = scenario("chains2").draw(32, 0)
+        windows = Windows(SCENE, [(episodes, 1.0)], Recipe(batch=64))
+        return Simulator(SCENE, TINY, statistics_of(SCENE, TINY, windows, np.random.default_rng(0), batches=2))
+
+
+@pytest.fixture(scope="module")
+def meetings() -> np.ndarray:
+    """Eight states (8, L, 13) two steps before two chains meet."""
+    with jax.enable_x64(False):
+        episodes, _ = scenario("chains2").draw(32, 1)
+        contacts = first_contacts(SCENE, episodes.states, chunk=32)
+    rows = np.flatnonzero(contacts >= 2)[:8]
+    states = episodes.states[rows, contacts[rows] - 2].astype(float)
+    states[..., packed.ORIENTATION] /= np.linalg.norm(states[..., packed.ORIENTATION], axis=-1, keepdims=True)
+    return states
+
+
+def roll(simulator: Simulator, states: np.ndarray) -> np.ndarray:
+    """Predicted states (N, STEPS, L, 13)."""
+    controls = np.zeros((len(states), STEPS, 0, 3))
+    return np.asarray(ROLL(simulator.scene, simulator.config, simulator.weights, states, controls))
+
+
+def apart(first: np.ndarray, second: np.ndarray) -> float:
+    """Largest difference of places and velocities, orientations left out."""
+    return float(np.abs(np.delete(first - second, np.s_[packed.ORIENTATION], axis=-1)).max())
+
+
+def test_chains_push_each_other(simulator: Simulator, meetings: np.ndarray) -> None:
+    alone = Simulator(SCENE.only("first"), TINY, simulator.weights)
+    assert apart(roll(simulator, meetings)[:, :, :2], roll(alone, meetings[:, :2])) > 0.1, (
+        "else there is little to test"
+    )
+
+
+def test_turning_the_world_turns_the_prediction(simulator: Simulator, meetings: np.ndarray) -> None:
+    angle = np.linspace(-3.0, 3.0, len(meetings))
+    turn = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+    turned = np.asarray(features.turn_states(jnp.asarray(meetings), turn))
+    expected = features.turn_states(jnp.asarray(roll(simulator, meetings)), turn[:, None])
+    assert apart(roll(simulator, turned), np.asarray(expected)) < 1e-7
+
+
+def test_shifting_the_world_shifts_the_prediction(simulator: Simulator, meetings: np.ndarray) -> None:
+    shift = np.zeros(packed.SIZE)
+    shift[:2] = 3.0, -7.0
+    assert apart(roll(simulator, meetings + shift), roll(simulator, meetings) + shift) < 1e-7
+
+
+def test_how_a_capsule_has_rolled_about_its_axis_changes_nothing(simulator: Simulator, meetings: np.ndarray) -> None:
+    alone = Simulator(SCENE.only("first"), TINY, simulator.weights)
+    before = meetings[:, :2]
+    angle = np.linspace(-2.0, 2.0, 2 * len(meetings)).reshape(len(meetings), 2, 1)
+    about = rotation.from_rotation_vector(jnp.asarray(angle * np.array(SCENE.links[0].axis)))
+    rolled = before.copy()
+    rolled[..., packed.ORIENTATION] = rotation.multiply(jnp.asarray(before[..., packed.ORIENTATION]), about)
+    assert apart(roll(alone, rolled), roll(alone, before)) < 1e-7
+
+
+def test_a_batch_equals_single_runs(simulator: Simulator, meetings: np.ndarray) -> None:
+    alone = np.concatenate([roll(simulator, each[None]) for each in meetings[:3]])
+    np.testing.assert_allclose(alone, roll(simulator, meetings)[:3], atol=1e-9)
+
+
+def test_what_the_base_is_survives_on_disk(simulator: Simulator, tmp_path: Path) -> None:
+    manifest = stored.save(tmp_path, "tiny", SCENE, TINY, simulator.weights, {})
+    assert stored.load(manifest, SCENE)[0].base == "mechanics"
+
+
+@pytest.mark.parametrize(
+    ("name", "bars"), [("chains1", (0.0015, 0.012)), ("chains2", (0.002, 0.018)), ("chain4", (0.002, 0.018))]
+)
+def test_the_shipped_chains_err_no_more_than_they_did(name: str, bars: tuple[float, float]) -> None:
+    chosen = scenario(name)
+    with jax.enable_x64(False):
+        config, learned, _ = stored.load(stored.SHIPPED / f"{name}.json", chosen.scene)
+        given, _ = chosen.draw(32, 3)
+        simulator = Simulator(chosen.scene, config, learned)
+        found = evaluation.predict(simulator, given.states[:, 0], given.controls[:, :40], given.torques[:, :40], 32)
+    error = np.linalg.norm((found - given.states[:, 1:41])[..., packed.POSITION], axis=-1)
+    assert error[:, :10].mean() < bars[0] and error.mean() < bars[1]
