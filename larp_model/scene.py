@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -259,6 +259,18 @@ class Scene:
             start = self.rows(body.name).start
             for child, joint in enumerate(body.joints, start=1):
                 yield start + child, start + joint.parent, joint
+
+    def sized(self, morphology: np.ndarray) -> Scene:
+        """The scene with links of these lengths [m], radii [m] and masses [kg], (L, 3)."""
+        sizes = np.asarray(morphology, float)
+        if sizes.shape != (len(self.links), 3):
+            raise ValueError(f"morphology has shape {sizes.shape}, but needs ({len(self.links)}, 3)")
+        bodies = []
+        for body in self.bodies:
+            own = zip(body.links, sizes[self.rows(body.name)].tolist(), strict=True)
+            links = (replace(link, length=length, radius=radius, mass=mass) for link, (length, radius, mass) in own)
+            bodies.append(replace(body, links=tuple(links)))
+        return replace(self, bodies=tuple(bodies))
 
     def only(self, *names: str) -> Scene:
         """The scene with these bodies alone."""

@@ -201,6 +201,34 @@ def test_contacts_that_a_scene_leaves_out_do_not_happen(scene: Scene) -> None:
     assert pairs == len(scene.links) + len(scene.pairs[0].first_links)
 
 
+def test_a_batch_of_bodies_equals_simulations_of_each_alone() -> None:
+    scene, random = Scene((chain(links=3),)), np.random.default_rng(0)
+    usual = np.array([(link.length, link.radius, link.mass) for link in scene.links])
+    morphology = usual * random.uniform(0.7, 1.3, (4, 3, 3))
+    states = np.zeros((4, 3, 13))
+    states[..., 2], states[..., 3] = 1.0, 1.0
+    states[..., 10:] = random.standard_normal((4, 3, 3))
+    controls = np.zeros((4, 60, 0, 3))
+    truth = Truth(scene, 4)
+    truth.resize(morphology)
+    together, _ = truth.rollout(states, controls)
+    for index in range(4):
+        alone, _ = Truth(scene.sized(morphology[index])).rollout(states[[index]], controls[[index]])
+        np.testing.assert_array_equal(together[[index]], alone)
+    truth.resize(np.broadcast_to(usual, morphology.shape))
+    np.testing.assert_array_equal(truth.rollout(states, controls)[0], Truth(scene, 4).rollout(states, controls)[0])
+
+
+def test_sizes_that_are_none_are_refused_by_link(scene: Scene) -> None:
+    truth = Truth(scene, 2)
+    morphology = np.tile([(link.length, link.radius, link.mass) for link in scene.links], (2, 1, 1))
+    morphology[1, 2, 1] = -0.1
+    with pytest.raises(ValueError, match=r"link 'head'.radius is -0.1"):
+        truth.resize(morphology)
+    with pytest.raises(ValueError, match=r"morphology has shape \(1, 14, 3\), but needs \(2, 14, 3\)"):
+        truth.resize(morphology[:1])
+
+
 def test_substeps_must_be_positive(scene: Scene) -> None:
     with pytest.raises(ValueError, match="substeps is 0"):
         Truth(scene, substeps=0)

@@ -117,6 +117,15 @@ class Truth:
     def _names(self) -> list[str]:
         return [f"{body.name}/{link.name}" for body in self.scene.bodies for link in body.links]
 
+    def resize(self, morphology: np.ndarray) -> None:
+        """Give the links of each simulation their lengths [m], radii [m] and masses [kg], (N, L, 3); then `reset`."""
+        needed = (self.batch, len(self.scene.links), 3)
+        if np.shape(morphology) != needed:
+            raise ValueError(f"morphology has shape {np.shape(morphology)}, but needs {needed}")
+        sizes, which = np.unique(np.asarray(morphology, float), axis=0, return_inverse=True)
+        models = [compile_model(self.scene.sized(each), self.substeps) for each in sizes]
+        self._batch.set_models([models[index] for index in which.ravel()])
+
     @property
     def batch(self) -> int:
         """How many simulations run side by side."""
@@ -187,9 +196,14 @@ class Truth:
         return result, finite(result)
 
 
-def closed(scene: Scene, states: np.ndarray) -> np.ndarray:
-    """States (N, L, 13) whose joints come together: links that are not roots are put where their joints hold them."""
+def closed(scene: Scene, states: np.ndarray, morphology: np.ndarray | None = None) -> np.ndarray:
+    """States (N, L, 13) whose joints come together: links that are not roots are put where their joints hold them.
+
+    morphology: (N, L, 3); the scene's by default.
+    """
     truth = Truth(scene, len(states))
+    if morphology is not None:
+        truth.resize(morphology)
     truth.reset(states)
     return truth.state()
 
