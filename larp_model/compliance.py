@@ -36,11 +36,11 @@ def _holding(motor: Motor | None, damping: float) -> float:
     return HELD * damping if motor is None else motor.armature + HELD * motor.damping
 
 
-def compliance(scene: Scene, rows: np.ndarray, matrices: Array, points: Array, shape: Array) -> Array:
+def compliance(scene: Scene, rows: np.ndarray, matrices: Array, points: Array, morphology: Array) -> Array:
     """Velocity gained per impulse, (B, P, 3, 3) [1/kg], by a point of each of P links, in world axes.
 
     rows: (P,) the links. matrices: (B, L, 3, 3) rotations of all links. points: (B, P, 3) [m] from the links' centres.
-    shape: morphology (B or 1, L, 3).
+    morphology (B or 1, L, 3).
     """
     joints = {child: (parent, joint) for child, parent, joint in scene.joints()}
     stiff: dict[int, Array] = {}  # (G_jj + W_p)^-1 by link
@@ -48,7 +48,7 @@ def compliance(scene: Scene, rows: np.ndarray, matrices: Array, points: Array, s
 
     def inertia(row: int) -> tuple[Array, Array]:
         """1/m (B, 1, 1) and I^-1 (B, 3, 3)."""
-        length, radius, mass = shape[..., row, 0], shape[..., row, 1], shape[..., row, 2]
+        length, radius, mass = morphology[..., row, 0], morphology[..., row, 1], morphology[..., row, 2]
         along, across = moments(length, radius, mass)
         held = _holding(joints[row][1].motor, joints[row][1].damping) if row in joints else 0.0
         along, across = (along + held)[..., None, None], (across + held)[..., None, None]
@@ -60,7 +60,7 @@ def compliance(scene: Scene, rows: np.ndarray, matrices: Array, points: Array, s
         axis = np.asarray(scene.links[row].axis)
         along = axis @ point * axis
         along, across = (np.asarray(part, matrices.dtype) for part in (along, np.asarray(point) - along))
-        offset = 0.5 * shape[..., row, 0:1] * along + shape[..., row, 1:2] * across
+        offset = 0.5 * morphology[..., row, 0:1] * along + morphology[..., row, 1:2] * across
         return jnp.sum(matrices[..., row, :, :] * offset[..., None, :], axis=-1)
 
     def yields(row: int, point: Array) -> Array:

@@ -23,15 +23,16 @@ DIVERGED = 20.0
 
 
 def predict(
-    simulator: Simulator, states: np.ndarray, controls: np.ndarray, torques: np.ndarray, chunk: int = 128
-) -> np.ndarray:
+    simulator: Simulator, states: np.ndarray, controls: np.ndarray, torques: np.ndarray, morphology: np.ndarray,
+    chunk: int = 128,
+) -> np.ndarray:  # fmt: skip
     """States (E, H, L, 13) that the simulator predicts from states (E, L, 13), chunk by chunk."""
     roll = jax.jit(simulator.rollout)
     parts = []
     for begin in range(0, len(states), chunk):
         rows = np.minimum(np.arange(begin, begin + chunk), len(states) - 1)
-        chosen = [jnp.asarray(each[rows]) for each in (states, controls, torques)]
-        parts.append(np.asarray(roll(chosen[0], chosen[1], torques=chosen[2])))
+        start, targets, pushes, sizes = (jnp.asarray(each[rows]) for each in (states, controls, torques, morphology))
+        parts.append(np.asarray(roll(start, targets, torques=pushes, morphology=sizes)))
     return np.concatenate(parts)[: len(states)]
 
 
@@ -45,7 +46,8 @@ def evaluate(simulator: Simulator, episodes: Trajectories, windows: Sequence[int
     if episodes.controls.shape[1] < longest:
         raise ValueError(f"episodes have {episodes.controls.shape[1]} steps, but the windows need {longest}")
     scene = simulator.scene
-    predicted = predict(simulator, episodes.states[:, 0], episodes.controls[:, :longest], episodes.torques[:, :longest])
+    controls, torques = episodes.controls[:, :longest], episodes.torques[:, :longest]
+    predicted = predict(simulator, episodes.states[:, 0], controls, torques, episodes.morphology)
     true = episodes.states[:, 1 : longest + 1]
     distance = np.linalg.norm(predicted[..., packed.POSITION] - true[..., packed.POSITION], axis=-1)
     lost = ~(np.isfinite(distance).all(axis=(1, 2)) & (distance.max(axis=(1, 2)) < DIVERGED))
@@ -54,7 +56,7 @@ def evaluate(simulator: Simulator, episodes: Trajectories, windows: Sequence[int
         jnp.asarray(predicted[kept][..., packed.ORIENTATION]),
         rotation.conjugate(jnp.asarray(true[kept][..., packed.ORIENTATION])),
     )
-    apart = features.displacement(scene, jnp.asarray(predicted[kept]), features.morphology(scene))
+    apart = features.displacement(scene, jnp.asarray(predicted[kept]), jnp.asarray(episodes.morphology[kept][:, None]))
     return {
         "windows": {
             str(n): {body.name: mean(distance[kept, :n, scene.rows(body.name)]) for body in scene.bodies}
@@ -91,7 +93,7 @@ def launch(simulator: Simulator, episodes: Trajectories, before: int) -> dict[st
     row = struck(scene)
     if row is None:
         raise ValueError("simulator.scene has no body of one link that another can strike")
-    contacts = first_contacts(scene, episodes.states)
+    contacts = first_contacts(scene, episodes)
     steps = before + LAUNCH_STEPS
     rows = np.flatnonzero((contacts >= before) & (contacts + LAUNCH_STEPS <= episodes.controls.shape[1]))
     rows = rows[speed(episodes.states[rows, contacts[rows] + LAUNCH_STEPS, row]) > LAUNCH_SPEED]
@@ -101,7 +103,7 @@ def launch(simulator: Simulator, episodes: Trajectories, before: int) -> dict[st
     columns = start[:, None] + np.arange(steps)
     predicted = predict(
         simulator, episodes.states[rows, start], episodes.controls[rows[:, None], columns],
-        episodes.torques[rows[:, None], columns],
+        episodes.torques[rows[:, None], columns], episodes.morphology[rows],
     )[:, -1, row, packed.VELOCITY]  # fmt: skip
     true = episodes.states[rows, start + steps, row, packed.VELOCITY]
     size = np.linalg.norm(true, axis=-1)

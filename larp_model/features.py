@@ -48,19 +48,21 @@ class Statistics(NamedTuple):
         return outputs * self.spread + self.mean
 
 
-def morphology(scene: Scene) -> Array:
-    """Length [m], radius [m] and mass [kg] of every link of the scene, (L, 3)."""
-    return jnp.array([(link.length, link.radius, link.mass) for link in scene.links], jnp.float32)
+def morphology_of(scene: Scene) -> Array:
+    """The morphology (L, 3) that the scene has by itself."""
+    return jnp.asarray(scene.morphology)
 
 
-def anchors(points: list[tuple[float, float, float]], axes: list[tuple[float, float, float]], shape: Array) -> Array:
-    """Joint anchors (*, J, 3) [m] in the frames of links of morphology `shape` (*, J, 3)."""
+def anchors(
+    points: list[tuple[float, float, float]], axes: list[tuple[float, float, float]], morphology: Array
+) -> Array:
+    """Joint anchors (*, J, 3) [m] in the frames of links of a morphology (*, J, 3)."""
     axis, point = np.asarray(axes, np.float32), np.asarray(points, np.float32)
     along = np.sum(axis * point, axis=-1, keepdims=True) * axis
-    return 0.5 * shape[..., 0:1] * along + shape[..., 1:2] * (point - along)
+    return 0.5 * morphology[..., 0:1] * along + morphology[..., 1:2] * (point - along)
 
 
-def displacement(scene: Scene, state: Array, shape: Array) -> Array:
+def displacement(scene: Scene, state: Array, morphology: Array) -> Array:
     """Joint displacement (*, number of joints, 3) [m], world frame: the joint by the child, less by the parent."""
     joints = list(scene.joints())
     if not joints:
@@ -74,7 +76,7 @@ def displacement(scene: Scene, state: Array, shape: Array) -> Array:
         (parents, [j.parent_anchor for _, _, j in joints]),
     ):
         rows = np.array(found)
-        offset = anchors(points, [links[r].axis for r in rows], shape[..., rows, :])
+        offset = anchors(points, [links[r].axis for r in rows], morphology[..., rows, :])
         places.append(packed.position(state)[..., rows, :] + _apply(matrices[..., rows, :, :], offset))
     return places[0] - places[1]
 
@@ -109,17 +111,22 @@ def servo_torques(body: Body, state: Array, control: Array) -> Array:
     return _apply(rotation.matrix(turned[:, children]), pull)
 
 
-def ends_on_ground(body: Body, state: Array, shape: Array, dt: float) -> tuple[Array, Array]:
+def ends_on_ground(body: Body, state: Array, morphology: Array, dt: float) -> tuple[Array, Array]:
     """How the two ends of every link are to the ground: velocities (B, 2 n, 3) where near it, and scalars (B, 6 n).
 
     The scalars are clearance [m], nearness (1 on the ground, falling off over 3 cm), and depth [m] after `dt`.
     """
     axes = np.array([link.axis for link in body.links], np.float32)
-    half = _apply(rotation.matrix(packed.orientation(state)), 0.5 * shape[..., 0:1] * axes)
+    half = _apply(rotation.matrix(packed.orientation(state)), 0.5 * morphology[..., 0:1] * axes)
     arms = jnp.concatenate([half, -half], axis=-2)
     place, velocity, spin, radius = (
         jnp.concatenate([part, part], axis=-2)
-        for part in (packed.position(state), packed.velocity(state), packed.angular_velocity(state), shape[..., 1:2])
+        for part in (
+            packed.position(state),
+            packed.velocity(state),
+            packed.angular_velocity(state),
+            morphology[..., 1:2],
+        )
     )
     velocity = velocity + jnp.cross(spin, arms)
     clearance = (place + arms)[..., 2] - radius[..., 0]
@@ -129,15 +136,15 @@ def ends_on_ground(body: Body, state: Array, shape: Array, dt: float) -> tuple[A
 
 
 def body_inputs(
-    body: Body, turn: Array, state: Array, control: Array, torque: Array, apart: Array, shape: Array, aided: bool,
+    body: Body, turn: Array, state: Array, control: Array, torque: Array, apart: Array, morphology: Array, aided: bool,
     dt: float,
 ) -> Array:  # fmt: skip
     """Inputs (B, F) of the dynamics network, in the frame turned by `turn` (B, 2) about z.
 
-    state (B, n, 13), control (B, j, 3), torque (B, n, 3), joint displacement `apart` (B, n - 1, 3), shape (B or 1, n,
-    3) of the body's n links. As the paper lists them, contacts apart: root-relative position, height, rotation matrix,
-    velocities, length, radius, displacement, target quaternion, torque. aided: `servo_torques` and `ends_on_ground`
-    besides.
+    state (B, n, 13), control (B, j, 3), torque (B, n, 3), joint displacement `apart` (B, n - 1, 3), morphology (B or
+    1, n, 3) of the body's n links. As the paper lists them, contacts apart: root-relative position, height, rotation
+    matrix, velocities, length, radius, displacement, target quaternion, torque. aided: `servo_torques` and
+    `ends_on_ground` besides.
     """
     size, links = state.shape[0], len(body.links)
     position = packed.position(state)
@@ -153,17 +160,19 @@ def body_inputs(
     scalars = [
         position[..., 2],
         rotation.from_rotation_vector(control),
-        jnp.broadcast_to(shape[..., :2], (size, links, 2)),
+        jnp.broadcast_to(morphology[..., :2], (size, links, 2)),
     ]
     if aided:
-        velocities, ends = ends_on_ground(body, state, shape, dt)
+        velocities, ends = ends_on_ground(body, state, morphology, dt)
         vectors += [velocities, *([servo_torques(body, state, control)] if body.motors else [])]
         scalars.append(ends)
     turned = rotation.about_z(jnp.concatenate(vectors, axis=1), rotation.opposite(turn)[:, None])
     return _flat(turned, *scalars)
 
 
-def inputs_after(body: Body, turn: Array, state: Array, soon: Array, apart: Array, shape: Array, dt: float) -> Array:
+def inputs_after(
+    body: Body, turn: Array, state: Array, soon: Array, apart: Array, morphology: Array, dt: float
+) -> Array:
     """Inputs (B, F) of a network that corrects what mechanics says: how links (B, n, 13) are to the ground.
 
     soon (B, n, 13): with the velocities that they will have. Capsules are seen by their axes alone: how one has rolled
@@ -172,7 +181,7 @@ def inputs_after(body: Body, turn: Array, state: Array, soon: Array, apart: Arra
     links = len(body.links)
     position = packed.position(state)
     axes = jnp.array([link.axis for link in body.links], state.dtype)
-    velocities, ends = ends_on_ground(body, soon, shape, dt)
+    velocities, ends = ends_on_ground(body, soon, morphology, dt)
     vectors = [
         position - position[:, :1],
         _apply(rotation.matrix(packed.orientation(state)), axes),
@@ -182,7 +191,7 @@ def inputs_after(body: Body, turn: Array, state: Array, soon: Array, apart: Arra
         velocities,
     ]
     turned = rotation.about_z(jnp.concatenate(vectors, axis=1), rotation.opposite(turn)[:, None])
-    return _flat(turned, position[..., 2], jnp.broadcast_to(shape, (len(state), links, 3)), ends)
+    return _flat(turned, position[..., 2], jnp.broadcast_to(morphology, (len(state), links, 3)), ends)
 
 
 def with_pooled(inputs: Array, turn: Array, pooled: Array) -> Array:
@@ -209,13 +218,13 @@ class Ground(NamedTuple):
     slip: Array
 
 
-def ball_inputs(body: Body, state: Array, pooled: Array, shape: Array, gravity: float, dt: float) -> Ground:
+def ball_inputs(body: Body, state: Array, pooled: Array, morphology: Array, gravity: float, dt: float) -> Ground:
     """Inputs of a ball's network: scalars only, so that turning the world about z changes nothing.
 
-    state (B, 13), pooled impulse (B, 6), shape (B or 1, 3). slip (B, 3): velocity of the ball's lowest point [m/s].
+    state (B, 13), pooled impulse (B, 6), morphology (B or 1, 3). slip (B, 3): of the ball's lowest point [m/s].
     near (B,): 1 where the ball touches the ground within the step, falling to 0 over 1 cm above it.
     """
-    radius = shape[..., 1]
+    radius = morphology[..., 1]
     velocity, spin = packed.velocity(state), packed.angular_velocity(state)
     gap, falling = state[..., 2] - radius, -velocity[..., 2]
     closing = falling + 0.5 * gravity * dt
@@ -283,14 +292,14 @@ def pair_rows(scene: Scene, pair: Pair) -> tuple[np.ndarray, np.ndarray]:
     return first, second
 
 
-def _segments(scene: Scene, state: Array, rows: np.ndarray, matrices: Array, shape: Array) -> contact.Segment:
+def _segments(scene: Scene, state: Array, rows: np.ndarray, matrices: Array, morphology: Array) -> contact.Segment:
     axes = np.array([scene.links[row].axis for row in rows], np.float32)
-    half = _apply(matrices, 0.5 * shape[..., rows, 0:1] * axes)
-    radius = jnp.broadcast_to(shape[..., rows, 1], (*state.shape[:-2], len(rows)))
+    half = _apply(matrices, 0.5 * morphology[..., rows, 0:1] * axes)
+    radius = jnp.broadcast_to(morphology[..., rows, 1], (*state.shape[:-2], len(rows)))
     return contact.Segment(packed.position(state)[..., rows, :], half, radius)
 
 
-def contact_inputs(scene: Scene, pair: Pair, state: Array, free: Array, shape: Array) -> Touch:
+def contact_inputs(scene: Scene, pair: Pair, state: Array, free: Array, morphology: Array) -> Touch:
     """The contacts of `pair` in states (B, L, 13), at the moment the links meet in the step.
 
     free: states (B, L, 13) after the step if nothing touched; of it, the velocities count. Both links move on,
@@ -300,8 +309,8 @@ def contact_inputs(scene: Scene, pair: Pair, state: Array, free: Array, shape: A
     first, second = pair_rows(scene, pair)
     matrices = rotation.matrix(packed.orientation(state))
     turn = matrices[..., first, :, :]
-    a = _segments(scene, state, first, turn, shape)
-    b = _segments(scene, state, second, matrices[..., second, :, :], shape)
+    a = _segments(scene, state, first, turn, morphology)
+    b = _segments(scene, state, second, matrices[..., second, :, :], morphology)
 
     def motion(rows: np.ndarray) -> tuple[Array, Array, Array, Array]:
         velocity, spin = packed.velocity(state)[..., rows, :], packed.angular_velocity(state)[..., rows, :]
@@ -341,8 +350,8 @@ def contact_inputs(scene: Scene, pair: Pair, state: Array, free: Array, shape: A
     near = smooth_gate(lowest, NEAR)
     slide = relative - approach[..., None] * found.normal
 
-    given = compliance.compliance(scene, first, matrices, arm1, shape)
-    given += compliance.compliance(scene, second, matrices, arm2, shape)
+    given = compliance.compliance(scene, first, matrices, arm1, morphology)
+    given += compliance.compliance(scene, second, matrices, arm2, morphology)
     along_normal = jnp.sum(given * found.normal[..., None, :], axis=-1)
     mass = 1.0 / jnp.sum(along_normal * found.normal, axis=-1)
     up = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0], state.dtype), v1.shape)
@@ -368,24 +377,24 @@ def contact_inputs(scene: Scene, pair: Pair, state: Array, free: Array, shape: A
     return Touch(inputs, gaps[0], impact, near, found.normal, slide, arm1, arm2, mass)
 
 
-def within_reach(scene: Scene, pair: Pair, state: Array, free: Array, shape: Array) -> Array:
+def within_reach(scene: Scene, pair: Pair, state: Array, free: Array, morphology: Array) -> Array:
     """() whether any links of the pair, in any of the states (B, L, 13), may come nearer than `contact_inputs` minds.
 
     False only where all `near` of those inputs are zero: no point of a link moves faster than this bound.
     """
     first, second = pair_rows(scene, pair)
     matrices = rotation.matrix(packed.orientation(state))
-    a, b = (_segments(scene, state, rows, matrices[..., rows, :, :], shape) for rows in (first, second))
+    a, b = (_segments(scene, state, rows, matrices[..., rows, :, :], morphology) for rows in (first, second))
     speeds = []
     for each in (state, free):
         velocity, spin = packed.velocity(each), contact.norm(packed.angular_velocity(each))
-        swing = sum(0.5 * shape[..., rows, 0] * spin[..., rows] for rows in (first, second))
+        swing = sum(0.5 * morphology[..., rows, 0] * spin[..., rows] for rows in (first, second))
         speeds.append(contact.norm(velocity[..., second, :] - velocity[..., first, :]) + swing)
     lowest = contact.closest(a, b).distance - scene.dt * jnp.maximum(*speeds)
     return jnp.any(~(lowest >= NEAR))
 
 
-def paper_contact_inputs(scene: Scene, pair: Pair, state: Array, shape: Array) -> tuple[Array, Array]:
+def paper_contact_inputs(scene: Scene, pair: Pair, state: Array, morphology: Array) -> tuple[Array, Array]:
     """Inputs (B, P, F) of the paper's f_c as each of the two links sees the other, world frame.
 
     phi of both links (position relative to the first body's root, quaternion, velocities, length, radius, mass), and
@@ -394,11 +403,11 @@ def paper_contact_inputs(scene: Scene, pair: Pair, state: Array, shape: Array) -
     first, second = pair_rows(scene, pair)
     matrices = rotation.matrix(packed.orientation(state))
     found = contact.closest(
-        _segments(scene, state, first, matrices[..., first, :, :], shape),
-        _segments(scene, state, second, matrices[..., second, :, :], shape),
+        _segments(scene, state, first, matrices[..., first, :, :], morphology),
+        _segments(scene, state, second, matrices[..., second, :, :], morphology),
     )
     root = state[..., scene.rows(pair.first).start, :3] * jnp.array([1.0, 1.0, 0.0], state.dtype)
-    sizes = jnp.broadcast_to(shape, (*state.shape[:-2], *shape.shape[-2:]))
+    sizes = jnp.broadcast_to(morphology, (*state.shape[:-2], *morphology.shape[-2:]))
     phi = jnp.concatenate([packed.position(state) - root[..., None, :], state[..., 3:], sizes], axis=-1)
     distance = found.distance[..., None]
 
@@ -429,14 +438,13 @@ def turn_states(state: Array, turn: Array) -> Array:
     )
 
 
-def first_contact(scene: Scene, states: Array) -> Array:
+def first_contact(scene: Scene, states: Array, morphology: Array) -> Array:
     """(E,) the first step t of states (E, T + 1, L, 13) in which a pair's contact changes the second link's velocity.
 
-    The contact falls between states t and t + 1. -1 where there is none.
+    morphology (E or 1, L, 3). The contact falls between states t and t + 1. -1 where there is none.
     """
     if not scene.pairs:
         return jnp.full(states.shape[0], -1)
-    shape = morphology(scene)[None]
     free = jnp.array([0.0, 0.0, -scene.gravity * scene.dt], states.dtype)
 
     def hit(before: Array, after: Array) -> Array:
@@ -444,7 +452,7 @@ def first_contact(scene: Scene, states: Array) -> Array:
         for pair in scene.pairs:
             _, second = pair_rows(scene, pair)
             pushed = contact.norm(packed.velocity(after) - packed.velocity(before) - free)[:, second] > 0.3
-            found |= jnp.any((contact_inputs(scene, pair, before, before, shape).near > 0.1) & pushed, axis=1)
+            found |= jnp.any((contact_inputs(scene, pair, before, before, morphology).near > 0.1) & pushed, axis=1)
         return found
 
     def advance(carry: None, step: tuple[Array, Array]) -> tuple[None, Array]:

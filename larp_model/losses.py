@@ -61,19 +61,19 @@ def spin(predicted: Array, true: Array) -> Array:
     return jnp.sum((packed.angular_velocity(predicted) - packed.angular_velocity(true)) ** 2, axis=-1)
 
 
-def displacement(scene: Scene, predicted: Array, shape: Array) -> Array:
+def displacement(scene: Scene, predicted: Array, morphology: Array) -> Array:
     """Squared joint displacement (*, number of joints) [m^2]."""
-    return jnp.sum(features.displacement(scene, predicted, shape) ** 2, axis=-1)
+    return jnp.sum(features.displacement(scene, predicted, morphology) ** 2, axis=-1)
 
 
 def total(
-    scene: Scene, weights: LossWeights, emphasis: Array, predicted: Array, true: Array
+    scene: Scene, weights: LossWeights, emphasis: Array, predicted: Array, true: Array, morphology: Array
 ) -> tuple[Array, dict[str, Array]]:
     """The weighted sum and its terms, averaged over states (B, H, L, 13); `emphasis` (L,) weighs the links.
 
+    morphology (B or 1, L, 3).
     Sequences that stray further than `LOST` teach nothing: they are left out, and "lost" is their share.
     """
-    shape = features.morphology(scene)
     places = position(predicted, true)
     kept = jax.lax.stop_gradient(jnp.max(places, axis=(1, 2)) < LOST**2).astype(places.dtype)
 
@@ -83,7 +83,7 @@ def total(
     terms = {
         "position": mean(emphasis * pseudo_huber(places, weights.far)),
         "rotation": mean(rotation(predicted, true)),
-        "displacement": mean(displacement(scene, predicted, shape)),
+        "displacement": mean(displacement(scene, predicted, morphology[:, None])),
         "velocity": mean(emphasis * pseudo_huber(velocity(predicted, true), weights.fast)),
         "spin": mean(emphasis * pseudo_huber(weights.arm**2 * spin(predicted, true), weights.fast)),
     }

@@ -249,6 +249,11 @@ class Scene:
         return tuple(link for body in self.bodies for link in body.links)
 
     @property
+    def morphology(self) -> np.ndarray:
+        """Length [m], radius [m] and mass [kg] of every link, (L, 3)."""
+        return np.array([(link.length, link.radius, link.mass) for link in self.links], np.float32)
+
+    @property
     def motors(self) -> tuple[Motor, ...]:
         """All motors, in the order of the control."""
         return tuple(motor for body in self.bodies for _, _, motor in body.motors)

@@ -124,7 +124,7 @@ def untouched(state: Array) -> Pooled:
     return Pooled(jnp.zeros((*state.shape[:2], 6), state.dtype), jnp.zeros((*state.shape[:2], 3), state.dtype))
 
 
-def contacts(scene: Scene, config: Config, weights: Weights, state: Array, free: Array, shape: Array) -> Pooled:
+def contacts(scene: Scene, config: Config, weights: Weights, state: Array, free: Array, morphology: Array) -> Pooled:
     """Sum f_c over the contacts of every link (equation 1 of the paper).
 
     state (B, L, 13); free (B, L, 13), what it would become if nothing touched.
@@ -137,11 +137,11 @@ def contacts(scene: Scene, config: Config, weights: Weights, state: Array, free:
         to_first, to_second = (jax.nn.one_hot(rows, links, dtype=state.dtype) for rows in (first, second))
         network = partial(evaluate, contact_network(config), weights, name)
         if config.contact == "feature":
-            inputs = features.paper_contact_inputs(scene, pair, state, shape)
+            inputs = features.paper_contact_inputs(scene, pair, state, morphology)
             for seen, rows in zip(inputs, (to_first, to_second), strict=True):
                 feature += jnp.einsum("bpf,pl->blf", network(seen), rows)
             continue
-        touch = features.contact_inputs(scene, pair, state, free, shape)
+        touch = features.contact_inputs(scene, pair, state, free, morphology)
         outputs = bounded(network(touch.inputs), CONTACT_BOUNDS) * touch.near[..., None]
         impulse, lag = contact_impulse(touch, outputs)
         on_first = jnp.concatenate([-impulse, jnp.cross(touch.first_arm, -impulse)], axis=-1)
@@ -176,18 +176,18 @@ def step(
     state: Array,
     control: Array,
     torque: Array | None = None,
-    shape: Array | None = None,
+    morphology: Array | None = None,
     stop_gradient: bool = False,
 ) -> Array:
     """Advance states (B, L, 13) by `scene.dt` under joint targets (B, J, 3) [rad].
 
-    torque: external, (B, L, 3) [N m], world frame. shape: morphology (B or 1, L, 3); the scene's by default.
+    torque: external, (B, L, 3) [N m], world frame. morphology (B or 1, L, 3); the scene's by default.
     stop_gradient: hold the contact's inputs fixed, as in the paper's training; never when planning.
     """
     torque = jnp.zeros((*state.shape[:-1], 3), state.dtype) if torque is None else torque
-    shape = features.morphology(scene)[None] if shape is None else shape
+    morphology = features.morphology_of(scene)[None] if morphology is None else morphology
     seen = jax.lax.stop_gradient(state) if stop_gradient else state
-    bodies = list(articulated(scene, config, state, control, torque, shape))
+    bodies = list(articulated(scene, config, state, control, torque, morphology))
     free, changed = seen, []
     if config.contact == "impulse":
         changed = [dynamics(config, weights, each, each.inputs) for each in bodies]
@@ -196,7 +196,7 @@ def step(
         free = jax.lax.stop_gradient(free) if stop_gradient else free
 
         def meet() -> tuple[Pooled, list[Array]]:
-            pooled = contacts(scene, config, weights, seen, free, shape)
+            pooled = contacts(scene, config, weights, seen, free, morphology)
             return pooled, [
                 change + response(config, weights, each, pooled.feature[:, each.rows])
                 if responds(scene, config, each.body)
@@ -205,11 +205,11 @@ def step(
             ]
 
         # Steps without contact are by far the most.
-        near = [features.within_reach(scene, pair, seen, free, shape) for pair in scene.pairs]
+        near = [features.within_reach(scene, pair, seen, free, morphology) for pair in scene.pairs]
         apart = untouched(state), changed
         pooled, changed = jax.lax.cond(jnp.stack(near).any(), meet, lambda: apart) if near else apart
     else:
-        pooled = contacts(scene, config, weights, seen, free, shape)
+        pooled = contacts(scene, config, weights, seen, free, morphology)
         for each in bodies:
             own = pooled.feature[:, each.rows]
             changed.append(dynamics(config, weights, each, features.with_pooled(each.inputs, each.turn, own)))
@@ -218,7 +218,9 @@ def step(
         rows = scene.rows(body.name)
         if by_scalars(config, body):
             own_pooled = Pooled(pooled.feature[:, rows], pooled.travel[:, rows])
-            ball = ball_step(scene, config, weights, body, state[:, rows], own_pooled, torque[:, rows], shape[:, rows])
+            ball = ball_step(
+                scene, config, weights, body, state[:, rows], own_pooled, torque[:, rows], morphology[:, rows]
+            )
             after = after.at[:, rows].set(ball)
     return after
 
@@ -237,10 +239,10 @@ class Seen(NamedTuple):
 
 
 def articulated(
-    scene: Scene, config: Config, state: Array, control: Array, torque: Array, shape: Array
+    scene: Scene, config: Config, state: Array, control: Array, torque: Array, morphology: Array
 ) -> Iterator[Seen]:
     """All bodies that have a dynamics network, in states (B, L, 13)."""
-    apart, joint = features.displacement(scene, state, shape), 0
+    apart, joint = features.displacement(scene, state, morphology), 0
     for body in scene.bodies:
         rows, motors = scene.rows(body.name), scene.motor_rows(body.name)
         joints = slice(joint, joint + len(body.joints))
@@ -250,14 +252,22 @@ def articulated(
             base = jnp.zeros((1, 1, 1, 3), state.dtype)
             if config.base == "mechanics":
                 free = mechanics.free_motion(
-                    body, own, targets, torque[:, rows], shape[:, rows], scene.gravity, scene.dt
+                    body, own, targets, torque[:, rows], morphology[:, rows], scene.gravity, scene.dt
                 )
                 base = known_changes(own, free, scene.dt)
                 soon = packed.pack(packed.position(own), packed.orientation(own), free.velocity, free.spin)
-                inputs = features.inputs_after(body, turn, own, soon, apart[:, joints], shape[:, rows], scene.dt)
+                inputs = features.inputs_after(body, turn, own, soon, apart[:, joints], morphology[:, rows], scene.dt)
             else:
                 inputs = features.body_inputs(
-                    body, turn, own, targets, torque[:, rows], apart[:, joints], shape[:, rows], config.aided, scene.dt
+                    body,
+                    turn,
+                    own,
+                    targets,
+                    torque[:, rows],
+                    apart[:, joints],
+                    morphology[:, rows],
+                    config.aided,
+                    scene.dt,
                 )
             yield Seen(body, rows, turn, inputs, base)
 
@@ -348,16 +358,16 @@ def changes(config: Config, state: Array, after: Array, dt: float) -> Array:
 
 def ball_step(
     scene: Scene, config: Config, weights: Weights, body: Body, state: Array, pooled: Pooled, torque: Array,
-    shape: Array,
+    morphology: Array,
 ) -> Array:  # fmt: skip
     """One step of a ball (B, 1, 13): free flight, contacts' impulses, torque (B, 1, 3), a learned bounce and slide.
 
     Away from every contact it is exact free flight.
     """
     name, dt = dynamics_name(body), scene.dt
-    ball, impulse, shape = state[:, 0], pooled.feature[:, 0], shape[:, 0]
-    radius, mass = shape[:, 1:2], shape[:, 2:3]
-    ground = features.ball_inputs(body, ball, impulse, shape, scene.gravity, dt)
+    ball, impulse, morphology = state[:, 0], pooled.feature[:, 0], morphology[:, 0]
+    radius, mass = morphology[:, 1:2], morphology[:, 2:3]
+    ground = features.ball_inputs(body, ball, impulse, morphology, scene.gravity, dt)
     outputs = evaluate(dynamics_network(config, body), weights, name, ground.inputs)
     outputs = bounded(outputs, BALL_BOUNDS) * ground.near[:, None]
     scale, add, stick, drag, grip, roll, twist, late = jnp.split(outputs, len(BALL_BOUNDS), axis=-1)
@@ -395,30 +405,30 @@ class Simulator:
 
     differentiable = True
 
-    def step(self, state: Array, control: Array, torque: Array | None = None, shape: Array | None = None) -> Array:
+    def step(self, state: Array, control: Array, torque: Array | None = None, morphology: Array | None = None) -> Array:
         """States (N, L, 13) after one `scene.dt` under controls (N, J, 3) [rad]; see `rollout` for the rest."""
-        given = self._checked(state, control, torque, shape, ())
+        given = self._checked(state, control, torque, morphology, ())
         return step(self.scene, self.config, self.weights, *given)
 
     def rollout(
         self, state: Array, controls: Array, steps: Array | None = None, torques: Array | None = None,
-        shape: Array | None = None,
+        morphology: Array | None = None,
     ) -> Array:  # fmt: skip
         """States (N, H, L, 13) after each of H steps from states (N, L, 13) under controls (N, H, J, 3) [rad].
 
         From where a trajectory diverges it holds NaN: see `state.healthy`.
 
         steps (): so many of the H are computed, the rest repeat the last; all by default. torques: external, (N, H, L,
-        3) [N m]. shape: morphology (N or 1, L, 3); the scene's by default. All are taken in the state's precision, 32
+        3) [N m]. morphology (N or 1, L, 3); the scene's by default. All are taken in the state's precision, 32
         or 64 bits. Positions in 32 bits are 0.1 mm apart 1 km from the origin: plan near it.
         """
-        given = self._checked(state, controls, torques, shape, np.shape(controls)[1:2])
+        given = self._checked(state, controls, torques, morphology, np.shape(controls)[1:2])
         states = rollout(self.scene, self.config, self.weights, *given, steps=steps)
         lost = jnp.cumsum(~packed.healthy(states), axis=1) > 0
         return jnp.where(lost[..., None, None], jnp.nan, states)
 
     def _checked(
-        self, state: Array, control: Array, torque: Array | None, shape: Array | None, steps: tuple[int, ...]
+        self, state: Array, control: Array, torque: Array | None, morphology: Array | None, steps: tuple[int, ...]
     ) -> tuple[Array, Array, Array | None, Array | None]:
         """The public arguments as JAX arrays, refused by name where they do not fit; steps: (H,) or none."""
         state, links, motors = jnp.asarray(state), len(self.scene.links), len(self.scene.motors)
@@ -434,15 +444,17 @@ class Simulator:
             if value is not None and np.shape(value) != size:
                 wanted = f"({len(state)}, {'H, ' if steps else ''}{size[-2]}, 3)"
                 raise ValueError(f"{name} have shape {np.shape(value)}, but need {wanted}")
-        if shape is not None and np.shape(shape) not in ((1, links, 3), (len(state), links, 3)):
-            raise ValueError(f"shape has shape {np.shape(shape)}, but needs ({len(state)} or 1, {links}, 3)")
-        torque, shape = (None if value is None else jnp.asarray(value, state.dtype) for value in (torque, shape))
-        return state, jnp.asarray(control, state.dtype), torque, shape
+        if morphology is not None and np.shape(morphology) not in ((1, links, 3), (len(state), links, 3)):
+            raise ValueError(f"morphology has shape {np.shape(morphology)}, but needs ({len(state)} or 1, {links}, 3)")
+        torque, morphology = (
+            None if value is None else jnp.asarray(value, state.dtype) for value in (torque, morphology)
+        )
+        return state, jnp.asarray(control, state.dtype), torque, morphology
 
 
 def rollout(
     scene: Scene, config: Config, weights: Weights, state: Array, controls: Array, torques: Array | None = None,
-    shape: Array | None = None, stop_gradient: bool = False, steps: Array | None = None,
+    morphology: Array | None = None, stop_gradient: bool = False, steps: Array | None = None,
 ) -> Array:  # fmt: skip
     """States (B, H, L, 13) after each of H steps; the arguments are those of `step`, with a time axis second.
 
@@ -451,7 +463,7 @@ def rollout(
 
     def advance(current: Array, inputs: tuple[Array, Array | None]) -> Array:
         control, torque = inputs
-        return step(scene, config, weights, current, control, torque, shape, stop_gradient)
+        return step(scene, config, weights, current, control, torque, morphology, stop_gradient)
 
     def next_state(current: Array, inputs: tuple[Array, tuple[Array, Array | None]]) -> tuple[Array, Array]:
         number, given = inputs
@@ -485,13 +497,16 @@ def initial_weights(scene: Scene, config: Config, key: Array, statistics: Measur
     return Weights(networks, inputs, outputs)
 
 
-def measure(scene: Scene, config: Config, before: Array, after: Array, control: Array, torque: Array) -> Measured:
+def measure(
+    scene: Scene, config: Config, before: Array, after: Array, control: Array, torque: Array,
+    morphology: Array | None = None,
+) -> Measured:  # fmt: skip
     """Statistics of inputs and outputs by network, from true steps (B, L, 13) -> (B, L, 13).
 
-    Those of contacts are taken where there is one, for elsewhere their networks are not heard; the true step stands
-    for the one without contact.
+    morphology (B or 1, L, 3); the scene's by default. Statistics of contacts are taken where there is one, for
+    elsewhere their networks are not heard; the true step stands for the one without contact.
     """
-    shape = features.morphology(scene)[None]
+    morphology = features.morphology_of(scene)[None] if morphology is None else morphology
     rarely = 1e-3
     free = after
     found: Measured = {}
@@ -499,10 +514,10 @@ def measure(scene: Scene, config: Config, before: Array, after: Array, control: 
         rows = scene.rows(body.name)
         if by_scalars(config, body):
             ball, none = before[:, rows][:, 0], jnp.zeros((len(before), 6))
-            ground = features.ball_inputs(body, ball, none, shape[:, rows][:, 0], scene.gravity, scene.dt)
+            ground = features.ball_inputs(body, ball, none, morphology[:, rows][:, 0], scene.gravity, scene.dt)
             found[dynamics_name(body)] = Statistics.of(ground.inputs, ground.near + rarely), None
             free = free.at[:, rows].set(before[:, rows])
-    for seen in articulated(scene, config, before, control, torque, shape):
+    for seen in articulated(scene, config, before, control, torque, morphology):
         body, rows = seen.body, seen.rows
         outputs = changes(config, before[:, rows], after[:, rows], scene.dt) - seen.base
         outputs = outputs.reshape(len(before), -1, 3)
@@ -514,10 +529,10 @@ def measure(scene: Scene, config: Config, before: Array, after: Array, control: 
         if responds(scene, config, body):
             found[response_name(body)] = touched, None
     for pair in scene.pairs:
-        touch = features.contact_inputs(scene, pair, before, free, shape)
+        touch = features.contact_inputs(scene, pair, before, free, morphology)
         near = touch.near.reshape(-1) + rarely
         if config.contact == "feature":
-            sights = jnp.concatenate(features.paper_contact_inputs(scene, pair, before, shape), axis=1)
+            sights = jnp.concatenate(features.paper_contact_inputs(scene, pair, before, morphology), axis=1)
             near = jnp.tile(touch.near, (1, 2)).reshape(-1) + rarely
         else:
             sights = touch.inputs

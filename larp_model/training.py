@@ -26,7 +26,7 @@ from larp_model.simulator import Weights, initial_weights, measure, rollout
 
 
 class Trajectories(Protocol):
-    """Recorded truth: states (E, T + 1, L, 13), controls (E, T, J, 3) [rad], torques (E, T, L, 3) [N m]."""
+    """Recorded truth: see `truth.episodes.Episodes`."""
 
     @property
     def states(self) -> np.ndarray: ...
@@ -34,6 +34,8 @@ class Trajectories(Protocol):
     def controls(self) -> np.ndarray: ...
     @property
     def torques(self) -> np.ndarray: ...
+    @property
+    def morphology(self) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,15 @@ class Progressed(NamedTuple):
     update: int
 
 
+class Batch(NamedTuple):
+    """B windows of so many steps: states (B, steps + 1, L, 13), the rest as in episodes."""
+
+    states: np.ndarray
+    controls: np.ndarray
+    torques: np.ndarray
+    morphology: np.ndarray
+
+
 class Windows:
     """Draws training windows from sources of trajectories, each source with its share."""
 
@@ -94,10 +105,10 @@ class Windows:
         self.sources, self.recipe = [source for source, _ in sources], recipe
         share = np.array([share for _, share in sources], float)
         self.share = share / share.sum()
-        self.contacts = [first_contacts(scene, source.states) for source in self.sources]
+        self.contacts = [first_contacts(scene, source) for source in self.sources]
 
-    def draw(self, random: np.random.Generator, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """States (B, steps + 1, L, 13), controls (B, steps, J, 3) and torques (B, steps, L, 3)."""
+    def draw(self, random: np.random.Generator, steps: int) -> Batch:
+        """Windows of so many steps."""
         counts = random.multinomial(self.recipe.batch, self.share)
         parts = []
         for source, contacts, count in zip(self.sources, self.contacts, counts, strict=True):
@@ -119,18 +130,17 @@ class Windows:
                     source.states[rows, columns],
                     source.controls[rows, columns[:, :-1]],
                     source.torques[rows, columns[:, :-1]],
+                    source.morphology[chosen],
                 )
             )
-        states, controls, torques = (np.concatenate(column) for column in zip(*parts, strict=True))
-        return states, controls, torques
+        return Batch(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def first_contacts(scene: Scene, states: np.ndarray, chunk: int = 512) -> np.ndarray:
-    """`features.first_contact` (E,) of many trajectories (E, T + 1, L, 13), chunk by chunk."""
-    found = jax.jit(partial(features.first_contact, scene))
-    padded = np.concatenate([states, np.repeat(states[-1:], -len(states) % chunk, axis=0)])
-    parts = [np.asarray(found(padded[i : i + chunk])) for i in range(0, len(padded), chunk)]
-    return np.concatenate(parts)[: len(states)]
+def first_contacts(scene: Scene, episodes: Trajectories, chunk: int = 512) -> np.ndarray:
+    """`features.first_contact` (E,) of many trajectories, chunk by chunk."""
+    found, count = jax.jit(partial(features.first_contact, scene)), len(episodes.states)
+    rows = np.minimum(np.arange(count + -count % chunk), count - 1).reshape(-1, chunk)
+    return np.concatenate([found(episodes.states[each], episodes.morphology[each]) for each in rows])[:count]
 
 
 def statistics_of(
@@ -138,11 +148,12 @@ def statistics_of(
 ) -> Weights:
     """Fresh weights, their statistics measured on single true steps drawn as in training."""
     drawn = [windows.draw(random, 2) for _ in range(batches)]
-    states, controls, torques = (np.concatenate(column) for column in zip(*drawn, strict=True))
+    states, controls, torques, morphology = (np.concatenate(column) for column in zip(*drawn, strict=True))
     turns = features.random_turns(jax.random.key(int(random.integers(2**31))), len(states))
     if config.frame == "world":
         states = np.asarray(features.turn_states(jnp.asarray(states), turns[:, None]))
-    found = jax.jit(partial(measure, scene, config))(states[:, 0], states[:, 1], controls[:, 0], torques[:, 0])
+    step = states[:, 0], states[:, 1], controls[:, 0], torques[:, 0], morphology
+    found = jax.jit(partial(measure, scene, config))(*step)
     return initial_weights(scene, config, jax.random.key(int(random.integers(2**31))), found)
 
 
@@ -191,24 +202,23 @@ def train(
         weights = Weights(fixed | progressed.networks, *statistics)
     weigh = emphasis(scene, recipe)
 
-    def loss_of(
-        networks: dict[str, Any], states: Array, controls: Array, torques: Array
-    ) -> tuple[Array, dict[str, Array]]:
+    def loss_of(networks: dict[str, Any], states: Array, drawn: Any) -> tuple[Array, dict[str, Array]]:
         predicted = rollout(
-            scene, config, weights._replace(networks=fixed | networks), states[:, 0], controls, torques,
-            stop_gradient=recipe.stop_gradient,
+            scene, config, weights._replace(networks=fixed | networks), states[:, 0], drawn.controls, drawn.torques,
+            drawn.morphology, stop_gradient=recipe.stop_gradient,
         )  # fmt: skip
-        return losses.total(scene, recipe.loss, weigh, predicted, states[:, 1:])
+        return losses.total(scene, recipe.loss, weigh, predicted, states[:, 1:], drawn.morphology)
 
     @partial(jax.jit, donate_argnums=(0, 1))
     def update(
-        networks: dict[str, Any], state: Any, key: Array, states: Array, controls: Array, torques: Array
+        networks: dict[str, Any], state: Any, key: Array, drawn: Any
     ) -> tuple[dict[str, Any], Any, dict[str, Array]]:
+        states = drawn.states
         if config.frame == "world":
             turn = features.random_turns(key, len(states))
             states = features.turn_states(states, turn[:, None])
-            torques = features.rotation.about_z(torques, turn[:, None, None])
-        (loss, terms), gradient = jax.value_and_grad(loss_of, has_aux=True)(networks, states, controls, torques)
+            drawn = drawn._replace(torques=features.rotation.about_z(drawn.torques, turn[:, None, None]))
+        (loss, terms), gradient = jax.value_and_grad(loss_of, has_aux=True)(networks, states, drawn)
         norm = optax.tree.norm(gradient)
         good = jnp.isfinite(norm) & (norm < recipe.drop)
         gradient = jax.tree.map(lambda g: jnp.where(good, g, 0.0), gradient)
@@ -233,7 +243,7 @@ def train(
         for index in range(first, recipe.updates):
             drawn = windows.draw(np.random.default_rng((recipe.seed, index)), recipe.unroll(index))
             key = jax.random.fold_in(jax.random.key(recipe.seed), index)
-            networks, state, terms = update(networks, state, key, *drawn)
+            networks, state, terms = update(networks, state, key, drawn)
             values = {name: float(value) for name, value in terms.items()}
             recent.append(values)
             log["dropped"] += int(values["dropped"])

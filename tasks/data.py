@@ -120,17 +120,24 @@ def random_places(
     return found
 
 
-def resting(link: Link, states: np.ndarray) -> np.ndarray:
-    """Height (N,) [m] at which a link in states (N, 13) touches the ground, turned as it is."""
+def resting(link: Link, states: np.ndarray, sizes: np.ndarray | None = None) -> np.ndarray:
+    """Height (N,) [m] at which a link in states (N, 13) touches the ground, turned as it is.
+
+    sizes: (N, 3) length, radius and mass; the link's by default.
+    """
     turned = Rotation.from_quat(states[:, packed.ORIENTATION], scalar_first=True)
-    return link.radius + 0.5 * link.length * np.abs(turned.apply(link.axis)[:, 2])
+    length, radius = (link.length, link.radius) if sizes is None else (sizes[:, 0], sizes[:, 1])
+    return radius + 0.5 * length * np.abs(turned.apply(link.axis)[:, 2])
 
 
-def overlaps(scene: Scene, states: np.ndarray) -> np.ndarray:
-    """(N,) which of the states (N, L, 13) have a link inside another that it can touch."""
-    shape = features.morphology(scene)[None]
+def overlaps(scene: Scene, states: np.ndarray, morphology: np.ndarray | None = None) -> np.ndarray:
+    """(N,) which of the states (N, L, 13) have a link inside another that it can touch.
+
+    morphology: (N, L, 3); the scene's by default.
+    """
+    sizes = features.morphology_of(scene)[None] if morphology is None else jnp.asarray(morphology, jnp.float32)
     still = jnp.asarray(states)
-    gaps = [features.contact_inputs(scene, pair, still, still, shape).gap for pair in scene.pairs]
+    gaps = [features.contact_inputs(scene, pair, still, still, sizes).gap for pair in scene.pairs]
     return np.asarray(jnp.concatenate(gaps, axis=1).min(axis=1) < 0.0)
 
 
@@ -175,7 +182,7 @@ def contact_episodes(
     Returns them and how many diverged and were dropped.
     """
     random = np.random.default_rng(seed)
-    contacts = first_contacts(scene, source.states)
+    contacts = first_contacts(scene, source)
     rows = random.choice(np.flatnonzero((contacts >= 0) & (contacts + steps <= source.steps)), count)
     begin = np.maximum(contacts[rows] - random.integers(0, 4, count), 0)
     states = source.states[rows, begin].astype(float)

@@ -18,10 +18,23 @@ MEETING, HEIGHT, ASIDE = (0.1, 0.6), (0.3, 1.2), 0.1
 SPEED, RISING, SPIN, BEND = 1.5, 0.5, 2.0, 0.4
 # Torque on the first link of each body, standard deviation [N m], for so many steps.
 TORQUE, TURNED = 0.5, 10
+# Lengths and radii differ by up to this share.
+VARIED = 0.3
 
 
-def thrown_starts(random: np.random.Generator, scene: Scene, count: int) -> np.ndarray:
-    """States (count, L, 13) of bodies on their ways to one place, above the ground, joints closed."""
+def random_sizes(random: np.random.Generator, scene: Scene, count: int) -> np.ndarray:
+    """Morphologies (count, L, 3): links longer or shorter, thicker or thinner by up to `VARIED`, no denser."""
+    sizes = np.broadcast_to(scene.morphology, (count, len(scene.links), 3)).astype(float)
+    factors = random.uniform(1.0 - VARIED, 1.0 + VARIED, (*sizes.shape[:2], 2))
+    length, radius = np.moveaxis(sizes[..., :2] * factors, -1, 0)
+    volume = radius**2 * (length + 4.0 / 3.0 * radius)
+    usual = sizes[..., 1] ** 2 * (sizes[..., 0] + 4.0 / 3.0 * sizes[..., 1])
+    return np.stack([length, radius, sizes[..., 2] * volume / usual], axis=-1)
+
+
+def thrown_starts(random: np.random.Generator, scene: Scene, morphology: np.ndarray) -> np.ndarray:
+    """States (N, L, 13) of bodies of sizes (N, L, 3) on their ways to one place, above the ground, joints closed."""
+    count = len(morphology)
     states = np.zeros((count, len(scene.links), packed.SIZE))
     time, height = random.uniform(*MEETING, (count, 1)), random.uniform(*HEIGHT, count)
     for body in scene.bodies:
@@ -40,27 +53,37 @@ def thrown_starts(random: np.random.Generator, scene: Scene, count: int) -> np.n
         place = ASIDE * random.standard_normal((count, 3)) - velocity * time
         place[:, 2] += height + 0.5 * scene.gravity * time[:, 0] ** 2
         states[:, rows.start, packed.POSITION] = place
-    states = closed(scene, states)
+    states = closed(scene, states, morphology)
     # A body that starts in the ground is lifted out of it.
     for body in scene.bodies:
         rows = scene.rows(body.name)
-        above = [states[:, row, 2] - resting(scene.links[row], states[:, row]) for row in range(rows.start, rows.stop)]
+        above = [
+            states[:, row, 2] - resting(scene.links[row], states[:, row], morphology[:, row])
+            for row in range(rows.start, rows.stop)
+        ]
         states[:, rows, 2] -= np.minimum(np.min(above, axis=0), 0.0)[:, None]
     return states
 
 
-def thrown_episodes(scene: Scene, count: int, seed: int, steps: int = STEPS) -> tuple[Episodes, int]:
+def thrown_episodes(
+    scene: Scene, count: int, seed: int, steps: int = STEPS, varied: bool = False
+) -> tuple[Episodes, int]:
     """Episodes from `thrown_starts`, the first link of every chain turned by a torque at first.
 
-    Returns them and how many diverged and were dropped.
+    varied: bodies of `random_sizes`. Returns them and how many diverged and were dropped.
     """
     random = np.random.default_rng(seed)
-    states = thrown_starts(random, scene, 2 * count)
-    states = states[~overlaps(scene, states)][:count] if scene.pairs else states[:count]
+    if varied:
+        morphology = random_sizes(random, scene, 2 * count)
+    else:
+        morphology = np.broadcast_to(scene.morphology, (2 * count, len(scene.links), 3))
+    states = thrown_starts(random, scene, morphology)
+    apart = np.flatnonzero(~overlaps(scene, states, morphology) if scene.pairs else np.ones(2 * count, bool))[:count]
+    states, morphology = states[apart], morphology[apart]
     torques = np.zeros((len(states), steps, len(scene.links), 3))
     for body in scene.bodies:
         if body.joints:
             torque = TORQUE * random.standard_normal((len(states), 1, 3))
             torques[:, :TURNED, scene.rows(body.name).start] = torque
     controls = np.zeros((len(states), steps, 0, 3))
-    return record(Truth(scene, batch=min(count, 256)), states, controls, torques)
+    return record(Truth(scene, batch=min(count, 256)), states, controls, torques, morphology if varied else None)

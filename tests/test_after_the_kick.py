@@ -91,7 +91,7 @@ def test_sensing_keeps_joints_closed_and_has_the_noise_it_says(task: kick.Kick) 
     sense = sensing.noisy(task.scene, np.random.default_rng(0))
     state = task.reference.states[25].astype(float)
     seen = np.stack([sense(state) for _ in range(200)])
-    shape = features.morphology(task.scene)[None]
+    shape = features.morphology_of(task.scene)[None]
     apart = features.displacement(task.scene, jnp.asarray(seen), shape)
     assert float(jnp.abs(apart).max()) < 1e-5
     assert np.std(seen[:, task.ball, :3] - state[task.ball, :3]) == pytest.approx(sensing.BALL, rel=0.15)

@@ -48,7 +48,7 @@ def test_the_end_of_a_chain_gives_way_as_the_engines_inertia_says() -> None:
         mujoco.mj_fullM(model, data, inertia)
         mujoco.mj_jac(model, data, jacobian, None, state[0, -1, :3] + point, last)
         matrices = rotation.matrix(packed.orientation(jnp.asarray(state)))
-        shape = features.morphology(scene)[None]
+        shape = features.morphology_of(scene)[None]
         found = compliance(scene, np.array([3]), matrices, jnp.asarray(point)[None, None], shape)[0, 0]
         np.testing.assert_allclose(found, jacobian @ np.linalg.solve(inertia, jacobian.T), rtol=2e-3, atol=1e-3)
 
@@ -56,7 +56,7 @@ def test_the_end_of_a_chain_gives_way_as_the_engines_inertia_says() -> None:
 def test_compliance_is_symmetric_positive_and_less_than_a_free_links(scene: Scene, reference: Reference) -> None:
     state = jnp.asarray(reference.states[:40:4])
     rows, _ = features.pair_rows(scene, scene.pairs[0])
-    matrices, shape = rotation.matrix(packed.orientation(state)), features.morphology(scene)[None]
+    matrices, shape = rotation.matrix(packed.orientation(state)), features.morphology_of(scene)[None]
     points = jnp.asarray(np.random.default_rng(0).uniform(-0.1, 0.1, (10, len(rows), 3)), jnp.float32)
     found = np.asarray(compliance(scene, rows, matrices, points, shape))
     np.testing.assert_allclose(found, found.swapaxes(-1, -2), atol=1e-3)

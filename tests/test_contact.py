@@ -245,10 +245,10 @@ def test_a_foot_that_crosses_the_ball_within_a_step_is_seen(scene: Scene) -> Non
     touches = []
     for speed in (16.0, 0.9 * gap / scene.dt):
         state[0, foot, packed.VELOCITY] = 0.0, speed, 0.0
-        touches.append(seen(jnp.asarray(state), jnp.asarray(state), features.morphology(scene)[None]))
+        touches.append(seen(jnp.asarray(state), jnp.asarray(state), features.morphology_of(scene)[None]))
     free = state.copy()
     free[0, foot, packed.VELOCITY] *= 1.5  # it speeds up, and arrives after all
-    touches.append(seen(jnp.asarray(state), jnp.asarray(free), features.morphology(scene)[None]))
+    touches.append(seen(jnp.asarray(state), jnp.asarray(free), features.morphology_of(scene)[None]))
     fast, slow, faster = touches
     struck = scene.pairs[0].first_links.index("right_foot")
     assert fast.near[0, struck] == 1.0 and (np.delete(np.asarray(fast.near[0]), struck) == 0.0).all()
@@ -270,7 +270,7 @@ def test_links_out_of_reach_do_not_feel_each_other(scene: Scene) -> None:
         speed = random.uniform(0.0, 30.0, (count, 1, 1))
         each[..., packed.VELOCITY] = speed * random.standard_normal((*state.shape[:2], 3))
         each[..., packed.ANGULAR_VELOCITY] = 3.0 * speed * random.standard_normal((*state.shape[:2], 3))
-    shape, pair = features.morphology(scene)[None], scene.pairs[0]
+    shape, pair = features.morphology_of(scene)[None], scene.pairs[0]
     reach = jax.vmap(lambda one, after: features.within_reach(scene, pair, one[None], after[None], shape))
     within = np.asarray(jax.jit(reach)(jnp.asarray(state), jnp.asarray(free)))
     touch = jax.jit(partial(features.contact_inputs, scene, pair))(jnp.asarray(state), jnp.asarray(free), shape)

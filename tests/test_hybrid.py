@@ -46,7 +46,7 @@ def meetings() -> np.ndarray:
     """Eight states (8, L, 13) two steps before two chains meet."""
     with jax.enable_x64(False):
         episodes, _ = scenario("chains2").draw(32, 1)
-        contacts = first_contacts(SCENE, episodes.states, chunk=32)
+        contacts = first_contacts(SCENE, episodes, chunk=32)
     rows = np.flatnonzero(contacts >= 2)[:8]
     states = episodes.states[rows, contacts[rows] - 2].astype(float)
     states[..., packed.ORIENTATION] /= np.linalg.norm(states[..., packed.ORIENTATION], axis=-1, keepdims=True)
@@ -114,6 +114,8 @@ def test_the_shipped_chains_err_no_more_than_they_did(name: str, bars: tuple[flo
         config, learned, _ = stored.load(stored.SHIPPED / f"{name}.json", chosen.scene)
         given, _ = chosen.draw(32, 3)
         simulator = Simulator(chosen.scene, config, learned)
-        found = evaluation.predict(simulator, given.states[:, 0], given.controls[:, :40], given.torques[:, :40], 32)
+        found = evaluation.predict(
+            simulator, given.states[:, 0], given.controls[:, :40], given.torques[:, :40], given.morphology
+        )
     error = np.linalg.norm((found - given.states[:, 1:41])[..., packed.POSITION], axis=-1)
     assert error[:, :10].mean() < bars[0] and error.mean() < bars[1]

@@ -58,7 +58,7 @@ def motion_of(
     body: Body, state: Array, control: Array, torque: Array, gravity: float = 9.81, dt: float = 0.01
 ) -> Motion:
     """`free_motion` of the body as it is."""
-    return free_motion(body, state, control, torque, features.morphology(Scene((body,)))[None], gravity, dt)
+    return free_motion(body, state, control, torque, features.morphology_of(Scene((body,)))[None], gravity, dt)
 
 
 @cache
@@ -77,7 +77,7 @@ def moved(states: np.ndarray, motion: Motion) -> np.ndarray:
 
 def momenta(body: Body, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Momentum [kg m/s] and angular momentum [kg m^2/s] about the origin, (N, 3) each."""
-    shape = np.asarray(features.morphology(Scene((body,))), float)
+    shape = np.asarray(features.morphology_of(Scene((body,))), float)
     along, across = (np.asarray(each)[:, None] for each in moments(*shape.T))
     matrices = np.asarray(rotation.matrix(jnp.asarray(states[..., packed.ORIENTATION])))
     axis = np.einsum("nlij,lj->nli", matrices, np.array([link.axis for link in body.links]))
@@ -89,7 +89,7 @@ def momenta(body: Body, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def energy(body: Body, states: np.ndarray) -> np.ndarray:
     """Energy (N,) [J] of motion and height."""
-    length, radius, mass = np.asarray(features.morphology(Scene((body,))), float).T
+    length, radius, mass = np.asarray(features.morphology_of(Scene((body,))), float).T
     along, across = (np.asarray(each) for each in moments(length, radius, mass))  # type: ignore[arg-type]
     matrices = np.asarray(rotation.matrix(jnp.asarray(states[..., packed.ORIENTATION])))
     axis, spin = matrices @ np.array(body.links[0].axis), states[..., packed.ANGULAR_VELOCITY]
@@ -174,7 +174,7 @@ def test_a_joint_that_came_apart_closes_by_its_share(body: Body) -> None:
     open_[:, 1:, 0] += 1e-3 * np.arange(1, len(body.links))
 
     def gaps(found: np.ndarray) -> np.ndarray:
-        return np.linalg.norm(features.displacement(scene, jnp.asarray(found), features.morphology(scene)), axis=-1)
+        return np.linalg.norm(features.displacement(scene, jnp.asarray(found), features.morphology_of(scene)), axis=-1)
 
     after = moved(open_, compiled(body)(open_, controls, torques))
     before = gaps(open_)
@@ -184,7 +184,7 @@ def test_a_joint_that_came_apart_closes_by_its_share(body: Body) -> None:
 
 def test_a_chain_comes_to_rest_on_the_ground_and_is_given_no_energy() -> None:
     body = chain(links=4)
-    states = thrown_starts(np.random.default_rng(0), Scene((body,)), COUNT)
+    states = thrown_starts(np.random.default_rng(0), Scene((body,)), np.tile(Scene((body,)).morphology, (COUNT, 1, 1)))
     none = np.zeros((COUNT, 0, 3)), np.zeros((COUNT, len(body.links), 3))
     most = energy(body, states)
     for _ in range(300):

@@ -49,7 +49,7 @@ def simulator(request: pytest.FixtureRequest) -> Simulator:
 @pytest.fixture(scope="module")
 def kicks(scene: Scene, episodes: Episodes) -> tuple[np.ndarray, np.ndarray]:
     """Eight states (8, L, 13) two steps before a foot meets the ball, and controls (8, STEPS, J, 3)."""
-    contacts = first_contacts(scene, episodes.states)
+    contacts = first_contacts(scene, episodes)
     rows = np.flatnonzero((contacts >= 2) & (contacts + STEPS < episodes.steps))[:8]
     columns = contacts[rows, None] - 2 + np.arange(STEPS)
     states = episodes.states[rows, columns[:, 0]].astype(float)
@@ -214,10 +214,10 @@ def test_gradients_through_contact_are_finite_in_single_precision(
     with jax.enable_x64(False):
         states, controls = (jnp.asarray(part, jnp.float32) for part in kicks)
         states = states.at[0, -1, :3].set(states[0, 7, :3])  # the ball inside a foot
-        shape = features.morphology(simulator.scene)[None]
+        shape = features.morphology_of(simulator.scene)[None]
 
         def moved(states: Array, controls: Array, shape: Array) -> Array:
-            return simulator.rollout(states, controls, shape=shape)[..., :3].sum()
+            return simulator.rollout(states, controls, morphology=shape)[..., :3].sum()
 
         found = jax.jit(jax.grad(moved, argnums=(0, 1, 2)), compiler_options=SOON)(states, controls, shape)
     assert all(np.isfinite(part).all() for part in found)
@@ -267,14 +267,16 @@ def test_losses_of_the_truth_are_zero_and_grow_with_the_error(scene: Scene, epis
     true = true.at[..., packed.ORIENTATION].set(unit)
     flipped = true.at[..., packed.ORIENTATION].multiply(-1.0)
     weigh, zero = jnp.ones(len(scene.links)), LossWeights(velocity=1.0)
-    total, terms = losses.total(scene, zero, weigh, flipped, true)
+    total, terms = losses.total(scene, zero, weigh, flipped, true, features.morphology_of(scene)[None])
     assert float(total) < 1e-9 and all(float(value) > -1e-12 for value in terms.values())
     shifted = true.at[..., -1, packed.POSITION].add(jnp.array([0.3, 0.0, -0.4]))
     np.testing.assert_allclose(losses.position(shifted, true)[..., -1], 0.25)
     turned = true.at[..., packed.ORIENTATION].set(rotation.integrate(unit, jnp.array([0.2, 0.0, 0.0])))
     np.testing.assert_allclose(losses.rotation(turned, true), 1.0 - np.cos(0.1), atol=1e-12)
     stretched = true.at[..., 0, packed.POSITION].add(jnp.array([0.0, 0.0, 0.1]))
-    joints = np.asarray(losses.displacement(scene, stretched, features.morphology(scene))).reshape(-1, 12).mean(axis=0)
+    joints = (
+        np.asarray(losses.displacement(scene, stretched, features.morphology_of(scene))).reshape(-1, 12).mean(axis=0)
+    )
     on_pelvis = [parent == 0 for _, parent, _ in scene.joints()]
     np.testing.assert_allclose(joints, np.where(on_pelvis, 0.01, 0.0), atol=1e-6)
 
@@ -283,5 +285,6 @@ def test_emphasis_weighs_the_links_it_names(scene: Scene, episodes: Episodes) ->
     true = jnp.asarray(episodes.states[:4])
     shifted = true.at[..., -1, 0].add(1.0)
     even, ball = jnp.ones(len(scene.links)), jnp.ones(len(scene.links)).at[-1].set(3.0)
-    terms = [losses.total(scene, LossWeights(), weigh, shifted, true)[1]["position"] for weigh in (even, ball)]
+    sizes = features.morphology_of(scene)[None]
+    terms = [losses.total(scene, LossWeights(), weigh, shifted, true, sizes)[1]["position"] for weigh in (even, ball)]
     assert float(terms[1]) == pytest.approx(3.0 * float(terms[0]), rel=1e-5)

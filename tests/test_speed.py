@@ -23,7 +23,7 @@ def asked(engine: str = "mujoco", scene: str = "ball", reach: str | None = None,
 
 def near(what: Course) -> np.ndarray:
     """(T,) in which steps a link is near the ball, in the course as MuJoCo performs it."""
-    scene, shape = what.scene, features.morphology(what.scene)[None]
+    scene, shape = what.scene, features.morphology_of(what.scene)[None]
     after, _ = Truth(scene, len(what.states), threads=1).rollout(what.states, what.controls)
     states = np.concatenate([what.states[:, None], after], axis=1)
     times = range(what.controls.shape[1])

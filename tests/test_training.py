@@ -19,7 +19,7 @@ from larp_model.bodies import chain
 from larp_model.networks import Config
 from larp_model.scene import Scene
 from larp_model.simulator import Weights
-from larp_model.training import Recipe, Windows, first_contacts, statistics_of, train
+from larp_model.training import Batch, Recipe, Windows, first_contacts, statistics_of, train
 from larp_model.truth.episodes import Episodes, record
 from larp_model.truth.mujoco import Truth
 
@@ -44,25 +44,28 @@ def same(first: Weights, second: Weights) -> bool:
 def test_a_window_is_an_unbroken_piece_of_one_episode() -> None:
     episode, step = np.mgrid[:5, :31]
     mark = (100.0 * episode + step)[..., None, None]
-    source = Episodes(np.tile(mark, (1, 1, 2, 13)), mark[:, :-1, :0].repeat(3, -1), np.tile(mark[:, :-1], (1, 1, 2, 3)))
-    states, controls, torques = Windows(SWING, [(source, 1.0)], SHORT).draw(np.random.default_rng(0), 6)
+    sizes = np.arange(5.0)[:, None, None] * np.ones((1, 2, 3))
+    torques = np.tile(mark[:, :-1], (1, 1, 2, 3))
+    source = Episodes(np.tile(mark, (1, 1, 2, 13)), mark[:, :-1, :0].repeat(3, -1), torques, sizes)
+    states, controls, torques, morphology = Windows(SWING, [(source, 1.0)], SHORT).draw(np.random.default_rng(0), 6)
     assert (states.shape, controls.shape, torques.shape) == ((16, 7, 2, 13), (16, 6, 0, 3), (16, 6, 2, 3))
     np.testing.assert_array_equal(np.diff(states[:, :, 0, 0], axis=1), 1.0)
     np.testing.assert_array_equal(torques[:, :, 0, 0], states[:, :-1, 0, 0])
+    np.testing.assert_array_equal(morphology[:, 0, 0], states[:, 0, 0, 0] // 100)
     assert len(np.unique(states[:, 0, 0, 0])) > 8
 
 
 def test_windows_near_contact_begin_shortly_before_it(scene: Scene, episodes: Episodes) -> None:
     recipe = Recipe(batch=64, contact_share=0.75, before_contact=3)
-    states, _, _ = Windows(scene, [(episodes, 1.0)], recipe).draw(np.random.default_rng(0), 5)
-    found = first_contacts(scene, states, chunk=64)[:48]
+    drawn = Windows(scene, [(episodes, 1.0)], recipe).draw(np.random.default_rng(0), 5)
+    found = first_contacts(scene, drawn, chunk=64)[:48]
     assert (found >= 0).all() and (found <= 3).all() and len(np.unique(found)) == 4
 
 
 def test_sources_are_drawn_by_their_shares(swings: Episodes) -> None:
-    marked = Episodes(np.full_like(swings.states, 7.0), swings.controls, swings.torques)
+    marked = swings._replace(states=np.full_like(swings.states, 7.0))
     recipe = dataclasses.replace(SHORT, batch=4000)
-    states, _, _ = Windows(SWING, [(swings, 3.0), (marked, 1.0)], recipe).draw(np.random.default_rng(0), 1)
+    states, *_ = Windows(SWING, [(swings, 3.0), (marked, 1.0)], recipe).draw(np.random.default_rng(0), 1)
     assert np.mean(states[:, 0, 0, 0] == 7.0) == pytest.approx(0.25, abs=0.03)
 
 
@@ -103,7 +106,7 @@ def test_a_training_cut_off_goes_on_as_if_it_had_not_been(
     monkeypatch.setattr(training, "time", SimpleNamespace(perf_counter=count(0.0, 100.0).__next__))
     draw, drawn = Windows.draw, count()
 
-    def cut_off(self: Windows, random: np.random.Generator, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def cut_off(self: Windows, random: np.random.Generator, steps: int) -> Batch:
         if next(drawn) == 182:  # after 32 batches for the statistics and 150 updates
             raise KeyboardInterrupt
         return draw(self, random, steps)
@@ -128,7 +131,7 @@ def test_bad_batches_are_dropped_and_counted(compact: Config, swings: Episodes, 
     states[3] = np.nan
     start, recipe = measured(compact, swings), dataclasses.replace(SHORT, batch=8)
     before = jax.tree.map(np.array, start)
-    sources = [(Episodes(states, swings.controls, swings.torques), 1.0)]
+    sources = [(swings._replace(states=states), 1.0)]
     weights, log = train(SWING, compact, recipe, sources, tmp_path, start, quiet=True)
     drawn = [Windows(SWING, sources, recipe).draw(np.random.default_rng((0, i)), 2)[0] for i in range(200)]
     bad = sum(int(np.isnan(states).any()) for states in drawn)
@@ -140,7 +143,7 @@ def test_bad_batches_are_dropped_and_counted(compact: Config, swings: Episodes, 
 def test_training_on_bad_data_alone_stops_with_the_last_good_weights(
     compact: Config, swings: Episodes, tmp_path: Path
 ) -> None:
-    worthless = Episodes(np.full_like(swings.states, np.nan), swings.controls, swings.torques)
+    worthless = swings._replace(states=np.full_like(swings.states, np.nan))
     start = jax.tree.map(np.array, measured(compact, swings))
     weights, log = train(SWING, compact, SHORT, [(worthless, 1.0)], tmp_path, start, quiet=True)
     assert log["stopped_early"] and log["dropped"] == 100 and same(weights, start)

@@ -17,7 +17,7 @@ from larp_model import state as packed
 from larp_model.bodies import ball, capsule, chain, human, standing_height
 from larp_model.scene import Scene
 from larp_model.training import first_contacts
-from larp_model.truth.episodes import Episodes, join, load, record, save
+from larp_model.truth.episodes import VERSION, Episodes, join, load, record, save
 from larp_model.truth.mujoco import SUBSTEPS, Truth, compile_model
 from tasks.data import smooth_noise, stray
 from tasks.references import Reference, standing_on_ground
@@ -118,7 +118,7 @@ def test_recorded_joints_do_not_come_apart(scene: Scene, reference: Reference) -
     falling = np.concatenate([truth.state(), *(truth.step(np.zeros((1, 0, 3))) for _ in range(30))])
     with jax.enable_x64(True):
         for described, states in ((scene, reference.states), (chains, falling)):
-            apart = features.displacement(described, jnp.asarray(states), features.morphology(described))
+            apart = features.displacement(described, jnp.asarray(states), features.morphology_of(described))
             assert np.linalg.norm(apart, axis=-1).max() < 1e-6
 
 
@@ -176,7 +176,7 @@ def test_halving_the_engine_step_does_not_move_the_launch(scene: Scene, referenc
     steps = reference.strike + 12
     states, controls = kicks(scene, reference, 360, steps, seed=4)
     episodes, _ = record(Truth(scene, batch=360), states, controls)
-    contacts = first_contacts(scene, episodes.states, 360)
+    contacts = first_contacts(scene, episodes, 360)
     rows = np.flatnonzero((contacts >= before) & (contacts + after <= steps))
     launches = []
     for substeps in (SUBSTEPS, 2 * SUBSTEPS):
@@ -261,13 +261,13 @@ def rewrite(path: Path, **changes: np.ndarray) -> None:
 
 def header(**changes: object) -> np.ndarray:
     names = [link.name for link in Scene((human(), ball())).links]
-    return np.array(json.dumps({"version": 1, "dt": 0.01, "links": names} | changes))
+    return np.array(json.dumps({"version": VERSION, "dt": 0.01, "links": names} | changes))
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"header": header(version=2)}, "version 2"),
+        ({"header": header(version=1)}, "version 1"),
         ({"header": header(dt=0.02)}, "another scene"),
         ({"header": header(links=["a"])}, "another scene"),
         ({"header": np.array("{")}, "cannot be read"),
@@ -277,6 +277,7 @@ def header(**changes: object) -> np.ndarray:
         ({"controls": np.zeros((3, 29, 12, 3))}, "states has shape"),
         ({"controls": np.zeros(3)}, "has shape"),
         ({"torques": np.full((3, 30, 14, 3), np.nan)}, "torques holds values that are not finite"),
+        ({"morphology": np.ones((3, 13, 3))}, r"morphology has shape \(3, 13, 3\)"),
         ({"states": np.array([[None]])}, "cannot be read"),
     ],
 )

@@ -14,19 +14,20 @@ from larp_model.files import written_whole
 from larp_model.scene import Scene
 from larp_model.truth.mujoco import Truth
 
-VERSION = 1
+VERSION = 2
 
 
 class Episodes(NamedTuple):
     """E recorded trajectories of T steps.
 
     states: (E, T + 1, L, 13), the first before any step. controls: (E, T, J, 3) [rad]. torques: (E, T, L, 3) [N m],
-    external, world frame.
+    external, world frame. morphology: (E, L, 3) length [m], radius [m] and mass [kg] of every link.
     """
 
     states: np.ndarray
     controls: np.ndarray
     torques: np.ndarray
+    morphology: np.ndarray
 
     @property
     def steps(self) -> int:
@@ -35,21 +36,28 @@ class Episodes(NamedTuple):
 
 
 def record(
-    truth: Truth, states: np.ndarray, controls: np.ndarray, torques: np.ndarray | None = None
+    truth: Truth,
+    states: np.ndarray,
+    controls: np.ndarray,
+    torques: np.ndarray | None = None,
+    morphology: np.ndarray | None = None,
 ) -> tuple[Episodes, int]:
     """Roll out any number of controls (E, T, J, 3) from states (E, L, 13); returns the episodes and how many diverged.
 
-    Diverged trajectories are dropped.
+    morphology: (E, L, 3); the scene's by default. Diverged trajectories are dropped.
     """
     count, links = len(states), len(truth.scene.links)
     if controls.shape[0] != count:
         raise ValueError(f"controls hold {controls.shape[0]} episodes, but states hold {count}")
     if torques is None:
         torques = np.zeros((*controls.shape[:2], links, 3), np.float32)
+    sizes = np.broadcast_to(truth.scene.morphology, (count, links, 3)) if morphology is None else morphology
     kept, dropped = [], 0
     for start in range(0, count, truth.batch):
         chosen = np.arange(start, start + truth.batch)
         chosen[chosen >= count] = count - 1  # the last batch is filled up with copies
+        if morphology is not None:
+            truth.resize(morphology[chosen])
         truth.reset(states[chosen])
         first = truth.state()
         after, finite = truth.rollout(states[chosen], controls[chosen], torques[chosen])
@@ -58,9 +66,7 @@ def record(
         whole = np.concatenate([first[:, None], after], axis=1)
         rows = chosen[finite]
         kept.append(
-            Episodes(
-                whole[finite].astype(np.float32), controls[rows].astype(np.float32), torques[rows].astype(np.float32)
-            )
+            Episodes(*(each.astype(np.float32) for each in (whole[finite], controls[rows], torques[rows], sizes[rows])))
         )
     return join(kept), dropped
 
@@ -96,6 +102,7 @@ def load(path: Path, scene: Scene) -> Episodes:
         "states": (count, steps + 1, links, packed.SIZE),
         "controls": (count, steps, motors, 3),
         "torques": (count, steps, links, 3),
+        "morphology": (count, links, 3),
     }
     for name, shape in expected.items():
         found = getattr(episodes, name)

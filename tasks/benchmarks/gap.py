@@ -85,7 +85,8 @@ def candidates_of(
             )
             whole = np.concatenate([np.broadcast_to(state, (candidates, 1, *state.shape)), states], axis=1)[sound]
             torques = np.zeros((len(whole), controls.shape[1], len(kick.scene.links), 3), np.float32)
-            parts.append(Episodes(whole, np.asarray(controls)[sound], torques))
+            morphology = np.broadcast_to(kick.scene.morphology, (len(whole), *kick.scene.morphology.shape))
+            parts.append(Episodes(whole, np.asarray(controls)[sound], torques, morphology))
     return rows, Episodes(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 

@@ -134,9 +134,9 @@ def sizes(bench: Bench, body: str, field: str) -> list[Row]:
     scenes = [scaled(scene, body, field, factor) for factor in FACTORS]
     starts = np.stack([standing(each, bench.kick.start()) for each in scenes])
     controls = np.broadcast_to(bench.controls, (len(FACTORS), *bench.controls.shape))
-    shape = jnp.stack([features.morphology(each) for each in scenes])
-    states = np.asarray(jax.jit(bench.model.rollout)(starts, controls, shape=shape))
-    apart = np.asarray(jax.jit(lambda s: features.displacement(scene, s, shape[:, None]))(jnp.asarray(states)))
+    morphology = jnp.stack([features.morphology_of(each) for each in scenes])
+    states = np.asarray(jax.jit(bench.model.rollout)(starts, controls, morphology=morphology))
+    apart = np.asarray(jax.jit(lambda s: features.displacement(scene, s, morphology[:, None]))(jnp.asarray(states)))
     errors, found = [], []
     for index, (factor, each) in enumerate(zip(FACTORS, scenes, strict=True)):
         true, flags = Truth(each, 1, threads=1).rollout(starts[index][None], controls[index][None])
@@ -437,8 +437,8 @@ def horizons(bench: Bench) -> list[Row]:
     controls = kick.reference.window(0, length)[1][None]
     states = np.asarray(jax.jit(bench.model.rollout)(kick.start()[None], controls))[0]
     true, _ = Truth(scene, 1, threads=1).rollout(kick.start()[None], controls)
-    shape = features.morphology(scene)[None]
-    apart = np.linalg.norm(np.asarray(features.displacement(scene, jnp.asarray(states), shape)), axis=-1)
+    morphology = features.morphology_of(scene)[None]
+    apart = np.linalg.norm(np.asarray(features.displacement(scene, jnp.asarray(states), morphology)), axis=-1)
     found = []
     for steps in (100, 1_000, 5_000, length):
         part = sound(states[:steps])
@@ -594,12 +594,12 @@ def random_scenes(kind: str, model: Simulator, scenes: int, each: int, steps: in
         starts.append(state)
         targets.append(control)
         pushes.append(torque)
-        shapes.append(np.repeat(np.asarray(features.morphology(scene))[None], each, axis=0))
+        shapes.append(np.repeat(np.asarray(features.morphology_of(scene))[None], each, axis=0))
     larp_lost = 0
     size = CostTerm("size", lambda states, controls, context: states[:, :, 2])
     try:
         arguments = [np.concatenate(parts).astype(np.float32) for parts in (starts, targets, pushes, shapes)]
-        run = jax.jit(lambda s, u, t, shape: model.rollout(s, u, torques=t, shape=shape))
+        run = jax.jit(lambda s, u, t, morphology: model.rollout(s, u, torques=t, morphology=morphology))
         after = run(*arguments)
         costs = jax.vmap(lambda s, u: evaluate([size], s, u)[0])(after, arguments[1])
         lost = ~np.isfinite(after).all(axis=(1, 2, 3))

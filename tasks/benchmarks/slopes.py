@@ -31,7 +31,7 @@ def around_contact(bench: Bench, count: int, seed: int) -> tuple[np.ndarray, np.
     """States (count, L, 13) and targets (count, J, 3) [rad] of random episodes, the first half near first contacts."""
     random = np.random.default_rng(seed)
     episodes, _ = random_episodes(bench.kick.scene, bench.kick.reference, max(count // 4, 16), seed + 3)
-    contacts = first_contacts(bench.kick.scene, episodes.states)
+    contacts = first_contacts(bench.kick.scene, episodes)
     rows = random.integers(0, len(contacts), count)
     columns = random.integers(0, episodes.steps, count)
     rows[: count // 2] = random.choice(np.flatnonzero(contacts >= 0), count // 2)
