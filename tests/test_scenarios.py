@@ -66,6 +66,13 @@ def test_a_seed_draws_the_same_again_and_another_does_not() -> None:
     assert not np.array_equal(first.states, other.states)
 
 
+def test_links_of_chains_differ_in_size_and_balls_do_not() -> None:
+    chains, balls = (SCENARIOS[name].draw(8, 1)[0].morphology for name in ("chain4", "two_balls"))
+    assert (np.ptp(chains, axis=0) > 0.0).all() and not np.ptp(balls, axis=0).any()
+    density = chains[..., 2] / (chains[..., 1] ** 2 * (chains[..., 0] + 4.0 / 3.0 * chains[..., 1]))
+    np.testing.assert_allclose(density, density[0, 0], rtol=1e-5)
+
+
 def test_chains_are_turned_at_first_and_then_left_alone() -> None:
     torques = SCENARIOS["chain4"].draw(4, 1)[0].torques
     assert (torques[:, :10, 0] != 0.0).all() and not torques[:, 10:].any() and not torques[:, :, 1:].any()
