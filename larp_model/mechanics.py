@@ -292,16 +292,20 @@ def solve(inertia: Inertia, push: Push, levels: list[Level]) -> tuple[Array, Arr
         across = own.turning + cross_rows(own.mixed, level.child)
         along = jnp.swapaxes(own.mixed, 1, 2) + cross_rows(own.moving, level.child)
         across, along, moved = held((across, along, moved))
-        give = held(invert(across - cross_columns(level.child, along) + level.hold))
-        turned = mv(give, level.pull + moved.turning - cross(level.child, moved.moving))
-        to_turn, to_move = (mm(give, jnp.swapaxes(each, 1, 2)) for each in (across, along))
+        factor = held(cholesky(across - cross_columns(level.child, along) + level.hold))
+        # L^-1 (S' A), with which A - A S (L L')^-1 S' A stays positive in 32 bits, however light a link is held
+        half_turn, half_move = (lower(factor, jnp.swapaxes(each, 1, 2)) for each in (across, along))
+        half = lower(factor, (level.pull + moved.turning - cross(level.child, moved.moving))[:, :, None])
+        half_turn, half_move, half = held((half_turn, half_move, half))
+        to_turn, to_move = upper(factor, half_turn), upper(factor, half_move)
+        turned = upper(factor, half)[:, :, 0]
         turned, to_turn, to_move = held((turned, to_turn, to_move))
         passed.append((turned, to_turn, to_move))
         # What the joint hands on: A - A S (S' A S + G)^-1 S' A, seen from the parent's centre
         turning, mixed, moving = (
-            own.turning - mm(across, to_turn),
-            own.mixed - mm(across, to_move),
-            own.moving - mm(along, to_move),
+            own.turning - mm(jnp.swapaxes(half_turn, 1, 2), half_turn),
+            own.mixed - mm(jnp.swapaxes(half_turn, 1, 2), half_move),
+            own.moving - mm(jnp.swapaxes(half_move, 1, 2), half_move),
         )
         handed = Push(moved.turning - mv(across, turned), moved.moving - mv(along, turned))
         turning, mixed, moving, handed = held((turning, mixed, moving, handed))
@@ -378,6 +382,34 @@ def cross_rows(matrix: Array, vector: Array) -> Array:
 def _cross(first: Array, second: Array, axis: int) -> Array:
     (a, b, c), (x, y, z) = (jnp.moveaxis(each, axis, 0) for each in (first, second))
     return jnp.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=axis)
+
+
+def cholesky(matrix: Array) -> Array:
+    """Lower triangles L (n, 3, 3, B) of positive definite matrices L L'."""
+    a = jnp.sqrt(matrix[:, 0, 0])
+    b, c = matrix[:, 1, 0] / a, matrix[:, 2, 0] / a
+    d = jnp.sqrt(matrix[:, 1, 1] - b * b)
+    e = (matrix[:, 2, 1] - c * b) / d
+    f = jnp.sqrt(matrix[:, 2, 2] - c * c - e * e)
+    none = jnp.zeros_like(a)
+    rows = ((a, none, none), (b, d, none), (c, e, f))
+    return jnp.stack([jnp.stack(row, axis=1) for row in rows], axis=1)
+
+
+def lower(factor: Array, right: Array) -> Array:
+    """L^-1 of columns (n, 3, k, B)."""
+    x = right[:, 0] / factor[:, 0, 0, None]
+    y = (right[:, 1] - factor[:, 1, 0, None] * x) / factor[:, 1, 1, None]
+    z = (right[:, 2] - factor[:, 2, 0, None] * x - factor[:, 2, 1, None] * y) / factor[:, 2, 2, None]
+    return jnp.stack([x, y, z], axis=1)
+
+
+def upper(factor: Array, right: Array) -> Array:
+    """L'^-1 of columns (n, 3, k, B)."""
+    z = right[:, 2] / factor[:, 2, 2, None]
+    y = (right[:, 1] - factor[:, 2, 1, None] * z) / factor[:, 1, 1, None]
+    x = (right[:, 0] - factor[:, 1, 0, None] * y - factor[:, 2, 0, None] * z) / factor[:, 0, 0, None]
+    return jnp.stack([x, y, z], axis=1)
 
 
 def invert(matrix: Array) -> Array:

@@ -229,3 +229,16 @@ def test_forward_reverse_and_finite_difference_gradients_agree() -> None:
     step = 1e-6 * np.eye(len(given))
     several = jax.jit(jax.vmap(after), compiler_options=options)
     np.testing.assert_allclose((several(given + step) - several(given - step)).T / 2e-6, forward, atol=1e-5)
+
+
+def test_light_links_that_bear_on_the_ground_are_moved_alike_in_32_and_64_bits() -> None:
+    body = chain(links=4)
+    scene, random = Scene((body,)), np.random.default_rng(0)
+    states = thrown_starts(random, scene, np.tile(scene.morphology, (COUNT, 1, 1)))
+    none = np.zeros((COUNT, 0, 3)), np.zeros((COUNT, 4, 3))
+    for _ in range(60):
+        fine = compiled(body)(states, *none)
+        with jax.enable_x64(False):
+            coarse = compiled(body)(*(each.astype(np.float32) for each in (states, *none)))
+        assert np.abs(coarse.velocity - fine.velocity).max() < 5e-3
+        states = moved(states, fine)

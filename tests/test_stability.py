@@ -62,7 +62,8 @@ def test_a_prediction_is_flagged_from_where_it_diverges_and_no_other_row_with_it
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("torques", jnp.zeros((1, 3, 1, 3))), ("shape", jnp.zeros((2, 1, 3))), ("shape", jnp.zeros(3))]
+    ("name", "value"),
+    [("torques", jnp.zeros((1, 3, 1, 3))), ("morphology", jnp.zeros((2, 1, 3))), ("morphology", jnp.zeros(3))],
 )
 def test_arguments_that_do_not_fit_are_refused_by_name(ball_model: Simulator, name: str, value: jax.Array) -> None:
     with pytest.raises(ValueError, match=f"{name} ha"):
