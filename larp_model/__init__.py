@@ -1,17 +1,18 @@
 """LARP: scenes of articulated bodies, and their learned, differentiable simulator."""
 
 from larp_model.bodies import ball, capsule, chain, human, human_and_ball, standing_height
-from larp_model.networks import COMPACT, PAPER, Config
+from larp_model.designs import DESIGNS
+from larp_model.networks import Weights
+from larp_model.parts.part import Model
 from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface
-from larp_model.simulator import Simulator, Weights
+from larp_model.simulator import Simulator
 
 __all__ = [
-    "COMPACT",
-    "PAPER",
+    "DESIGNS",
     "Body",
-    "Config",
     "Joint",
     "Link",
+    "Model",
     "Motor",
     "Pair",
     "Scene",

@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model.scene import Motor, Scene
+from larp_model.kinematics import anchors
+from larp_model.scene import Body, Joint, Vector
 
 # For how long a motor's damping acts during an impact, as far as its armature-like effect goes [s].
 HELD = 0.002
@@ -32,17 +33,19 @@ def moments(length: Array, radius: Array, mass: Array) -> tuple[Array, Array]:
     return along, across
 
 
-def _holding(motor: Motor | None, damping: float) -> float:
-    return HELD * damping if motor is None else motor.armature + HELD * motor.damping
+def _stiffening(joint: Joint, held: float) -> float:
+    motor = joint.motor
+    return held * joint.damping if motor is None else motor.armature + held * motor.damping
 
 
-def compliance(scene: Scene, rows: np.ndarray, matrices: Array, points: Array, morphology: Array) -> Array:
-    """Velocity gained per impulse, (B, P, 3, 3) [1/kg], by a point of each of P links, in world axes.
+def compliance(
+    body: Body, rows: np.ndarray, matrices: Array, points: Array, morphology: Array, held: float = HELD
+) -> Array:
+    """Velocity gained per impulse, (B, P, 3, 3) [1/kg], by a point of each of P links of a body, in world axes.
 
-    rows: (P,) the links. matrices: (B, L, 3, 3) rotations of all links. points: (B, P, 3) [m] from the links' centres.
-    morphology (B or 1, L, 3).
+    rows: (P,) the links. matrices: (B, n, 3, 3) rotations of the body's links. points: (B, P, 3) [m] from the links'
+    centres. morphology (B or 1, n, 3). held: see `HELD`.
     """
-    joints = {child: (parent, joint) for child, parent, joint in scene.joints()}
     stiff: dict[int, Array] = {}  # (G_jj + W_p)^-1 by link
     identity = jnp.eye(3, dtype=matrices.dtype)
 
@@ -50,32 +53,29 @@ def compliance(scene: Scene, rows: np.ndarray, matrices: Array, points: Array, m
         """1/m (B, 1, 1) and I^-1 (B, 3, 3)."""
         length, radius, mass = morphology[..., row, 0], morphology[..., row, 1], morphology[..., row, 2]
         along, across = moments(length, radius, mass)
-        held = _holding(joints[row][1].motor, joints[row][1].damping) if row in joints else 0.0
-        along, across = (along + held)[..., None, None], (across + held)[..., None, None]
-        axis = matrices[..., row, :, :] @ jnp.asarray(scene.links[row].axis, matrices.dtype)
+        stiffer = _stiffening(body.joints[row - 1], held) if row else 0.0
+        along, across = (along + stiffer)[..., None, None], (across + stiffer)[..., None, None]
+        axis = matrices[..., row, :, :] @ jnp.asarray(body.links[row].axis, matrices.dtype)
         outer = axis[..., :, None] * axis[..., None, :]
         return 1.0 / mass[..., None, None], (identity - outer) / across + outer / along
 
-    def place(row: int, point: tuple[float, float, float]) -> Array:
-        axis = np.asarray(scene.links[row].axis)
-        along = axis @ point * axis
-        along, across = (np.asarray(part, matrices.dtype) for part in (along, np.asarray(point) - along))
-        offset = 0.5 * morphology[..., row, 0:1] * along + morphology[..., row, 1:2] * across
-        return jnp.sum(matrices[..., row, :, :] * offset[..., None, :], axis=-1)
+    def place(row: int, point: Vector) -> Array:
+        local = anchors([point], [body.links[row].axis], morphology[..., row : row + 1, :])
+        return jnp.sum(matrices[..., row, :, :] * local, axis=-1)
 
     def yields(row: int, point: Array) -> Array:
         """W at a point (B, 3) of a link."""
         lightness, inverse = inertia(row)
         cross_point = skew(point)
         free = lightness * identity - cross_point @ inverse @ cross_point
-        if row not in joints:
+        if not row:
             return free
-        parent, joint = joints[row]
+        joint = body.joints[row - 1]
         arm = place(row, joint.child_anchor)
         cross_arm = skew(arm)
         if row not in stiff:
             at_arm = lightness * identity - cross_arm @ inverse @ cross_arm
-            stiff[row] = invert(at_arm + yields(parent, place(parent, joint.parent_anchor)))
+            stiff[row] = invert(at_arm + yields(joint.parent, place(joint.parent, joint.parent_anchor)))
         across = lightness * identity - cross_point @ inverse @ cross_arm
         return free - across @ stiff[row] @ jnp.swapaxes(across, -1, -2)
 

@@ -16,8 +16,6 @@ from larp_model.scene import Surface
 
 # The share of the constraint that is a spring; the rest follows the free motion (MuJoCo's impedance).
 IMPEDANCE = 0.99
-# Newton steps of conservative advancement; three leave less than a millimetre at 10 m/s.
-ADVANCES = 3
 
 
 class Segment(NamedTuple):
@@ -121,15 +119,18 @@ def time_of_impact(distance: Array, approach: Array, limit: Array | float) -> Ar
     return jnp.where(closing | (distance <= 0.0), jnp.minimum(time, limit), limit)
 
 
-def impact(depth: Array, approach: Array, acceleration: Array | float, surface: Surface, time: Array) -> Impact:
+def impact(
+    depth: Array, approach: Array, acceleration: Array | float, surface: Surface, time: Array,
+    impedance: float = IMPEDANCE,
+) -> Impact:  # fmt: skip
     """The damped spring of `surface`, solved in closed form over `time` (*,) [s] from touching bodies.
 
     depth: (*,) [m] of penetration. approach: (*,) [m/s]. acceleration: [m/s^2] towards contact. The depth p follows
     p'' = (1 - d) a - d (k p + b p'), d the impedance, until it returns to zero; then the bodies part.
     """
-    decay = 0.5 * IMPEDANCE * surface.damping
-    frequency = jnp.sqrt(max(IMPEDANCE * surface.stiffness - decay**2, 0.01 * surface.stiffness))
-    equilibrium = (1.0 - IMPEDANCE) * acceleration / (IMPEDANCE * surface.stiffness)
+    decay = 0.5 * impedance * surface.damping
+    frequency = jnp.sqrt(max(impedance * surface.stiffness - decay**2, 0.01 * surface.stiffness))
+    equilibrium = (1.0 - impedance) * acceleration / (impedance * surface.stiffness)
     offset = depth - equilibrium
     rate = (approach + decay * offset) / frequency
     at_rest = jnp.abs(rate) + jnp.abs(offset) < 1e-9
@@ -151,3 +152,9 @@ def impact(depth: Array, approach: Array, acceleration: Array | float, surface: 
     meaningful = change > 1e-4
     lag = jnp.clip(jnp.where(meaningful, travel / jnp.where(meaningful, change, 1.0), 0.5 * time), 0.0, time)
     return Impact(change, lag, gap)
+
+
+def smooth_gate(gap: Array, margin: float) -> Array:
+    """1 where gap <= 0, 0 where gap >= margin, and smooth between."""
+    x = jnp.clip(1.0 - gap / margin, 0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from larp_model import features, rotation
+from larp_model import kinematics, rotation
 from larp_model import state as packed
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
@@ -56,7 +56,9 @@ def evaluate(simulator: Simulator, episodes: Trajectories, windows: Sequence[int
         jnp.asarray(predicted[kept][..., packed.ORIENTATION]),
         rotation.conjugate(jnp.asarray(true[kept][..., packed.ORIENTATION])),
     )
-    apart = features.displacement(scene, jnp.asarray(predicted[kept]), jnp.asarray(episodes.morphology[kept][:, None]))
+    apart = kinematics.displacement(
+        scene, jnp.asarray(predicted[kept]), jnp.asarray(episodes.morphology[kept][:, None])
+    )
     return {
         "windows": {
             str(n): {body.name: mean(distance[kept, :n, scene.rows(body.name)]) for body in scene.bodies}

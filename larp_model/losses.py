@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from larp_model import features
+from larp_model import kinematics
 from larp_model import state as packed
 from larp_model.scene import Scene
 
@@ -63,7 +63,7 @@ def spin(predicted: Array, true: Array) -> Array:
 
 def displacement(scene: Scene, predicted: Array, morphology: Array) -> Array:
     """Squared joint displacement (*, number of joints) [m^2]."""
-    return jnp.sum(features.displacement(scene, predicted, morphology) ** 2, axis=-1)
+    return jnp.sum(kinematics.displacement(scene, predicted, morphology) ** 2, axis=-1)
 
 
 def total(

@@ -16,6 +16,7 @@ vectors (n, 3, B), matrices (n, 3, 3, B), n links of one level of the tree.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -26,14 +27,24 @@ from jax import Array
 from larp_model import rotation
 from larp_model import state as packed
 from larp_model.compliance import moments
-from larp_model.scene import Body
+from larp_model.kinematics import anchors
+from larp_model.scene import Body, Vector
 
 GAMMA = 1.0 - math.sqrt(0.5)
-# Share of a joint's displacement that a step takes back (J. Baumgarte, Computer Methods 1 (1972)).
-CLOSING = 0.2
-# An end that stands on the ground is held as if by so many times its body's mass, one that slides by so many: held
-# harder, a direction of sliding that is half a step old throws the body.
-HELD_BY, HELD_LOOSELY_BY = 8.0, 0.2
+
+
+@dataclass(frozen=True)
+class Constants:
+    """What is chosen here, not derived.
+
+    closing: share of a joint's displacement that a step takes back (J. Baumgarte, Computer Methods 1 (1972)). standing,
+    sliding: an end that stands on the ground is held as if by so many times its body's mass, one that slides by so
+    many: held harder, a direction of sliding that is half a step old throws the body.
+    """
+
+    closing: float = 0.2
+    standing: float = 8.0
+    sliding: float = 0.2
 
 
 class Motion(NamedTuple):
@@ -63,6 +74,13 @@ class Push(NamedTuple):
     moving: Array
 
 
+class Anchors(NamedTuple):
+    """Of all joints, by their children and by their parents, (n - 1, 3, B) each."""
+
+    child: Array
+    parent: Array
+
+
 Begun = tuple[Array, Array, Array, Array]
 """What a stage starts from: see `free_motion`."""
 
@@ -84,8 +102,9 @@ class Level(NamedTuple):
 
 
 def free_motion(
-    body: Body, state: Array, control: Array, torque: Array, morphology: Array, gravity: float, dt: float
-) -> Motion:
+    body: Body, state: Array, control: Array, torque: Array, morphology: Array, gravity: float, dt: float,
+    constants: Constants = Constants(),
+) -> Motion:  # fmt: skip
     """How a body in states (B, n, 13) moves on within `dt` [s] if nothing but the ground touches it.
 
     control (B, j, 3) joint targets [rad], torque (B, n, 3) [N m] from outside, morphology (B or 1, n, 3).
@@ -95,8 +114,10 @@ def free_motion(
     position, orientation, velocity, spin = (
         state[:, columns] for columns in (packed.POSITION, packed.ORIENTATION, packed.VELOCITY, packed.ANGULAR_VELOCITY)
     )
-    child, parent = joint_anchors(body, sizes, turns(orientation))
-    gap = _at_parents(body, position, parent) - (position[1:] + child)
+    local = local_anchors(body, sizes)
+    child, parent = turned_anchors(body, local, turns(orientation))
+    parents = np.array([joint.parent for joint in body.joints], int)
+    gap = position[parents] + parent - (position[1:] + child)
     down = jnp.array([0.0, 0.0, -gravity], state.dtype)[:, None]
 
     def stage(raised: Array, turned: Array, velocity: Array, spin: Array) -> tuple[Array, Array]:
@@ -106,13 +127,13 @@ def free_motion(
         inertia = inertias(body, matrices, sizes)
         momentum, mass = mv(inertia.turning, spin), sizes[:, 2:3]
         push = Push(momentum + h * (outside - cross(spin, momentum)), mass * (velocity + h * down))
-        anchors = joint_anchors(body, sizes, matrices)
+        tied = turned_anchors(body, local, matrices)
         pull, hold = servos(body, start, targets, spin, h)
-        bearing = ground(body, turns(start), position[:, 2:] + raised, velocity, spin, sizes, gravity, h)
+        bearing = ground(body, turns(start), position[:, 2:] + raised, velocity, spin, sizes, gravity, h, constants)
         inertia, push = jax.tree.map(jnp.add, (inertia, push), bearing)
-        inertia, push, anchors, pull, hold = held((inertia, push, anchors, pull, hold))
+        inertia, push, tied, pull, hold = held((inertia, push, tied, pull, hold))
         levels = [
-            Level(rows, parents, *(each[rows - 1] for each in (*anchors, CLOSING / dt * gap, pull, hold)))
+            Level(rows, parents, *(each[rows - 1] for each in (*tied, constants.closing / dt * gap, pull, hold)))
             for rows, parents in tree(body)
         ]
         return solve(inertia, push, levels)
@@ -179,25 +200,23 @@ def _dot(first: Array, second: Array) -> Array:
     return x + y + z
 
 
-def joint_anchors(body: Body, sizes: Array, matrices: Array) -> tuple[Array, Array]:
-    """Where joints are from the centres of their children and of their parents, (n - 1, 3, B) [m] each."""
+def local_anchors(body: Body, sizes: Array) -> Anchors:
+    """Where joints are in the frames of their children and of their parents, (n - 1, 3, B or 1) [m] each."""
 
-    def place(rows: list[int], points: list[tuple[float, float, float]]) -> Array:
-        axis = np.array([body.links[row].axis for row in rows], np.float32).reshape(-1, 3)
-        point = np.array(points, np.float32).reshape(-1, 3)
-        along = np.sum(axis * point, axis=-1, keepdims=True) * axis
-        local = 0.5 * sizes[rows, 0:1] * along[..., None] + sizes[rows, 1:2] * (point - along)[..., None]
-        return mv(matrices[np.array(rows, int)], local)
+    def place(rows: list[int], points: list[Vector]) -> Array:
+        chosen = jnp.moveaxis(sizes[np.array(rows, int)], -1, 0)
+        return jnp.moveaxis(anchors(points, [body.links[row].axis for row in rows], chosen), 0, -1)
 
-    children = list(range(1, len(body.links)))
-    return (
-        place(children, [joint.child_anchor for joint in body.joints]),
+    return Anchors(
+        place(list(range(1, len(body.links))), [joint.child_anchor for joint in body.joints]),
         place([joint.parent for joint in body.joints], [joint.parent_anchor for joint in body.joints]),
     )
 
 
-def _at_parents(body: Body, position: Array, offset: Array) -> Array:
-    return position[np.array([joint.parent for joint in body.joints], int)] + offset
+def turned_anchors(body: Body, local: Anchors, matrices: Array) -> Anchors:
+    """The same from the links' centres, (n - 1, 3, B) [m], of links so turned (n, 3, 3, B)."""
+    parents = np.array([joint.parent for joint in body.joints], int)
+    return Anchors(mv(matrices[1:], local.child), mv(matrices[parents], local.parent))
 
 
 def inertias(body: Body, matrices: Array, sizes: Array) -> Inertia:
@@ -241,8 +260,9 @@ def servos(body: Body, orientation: Array, targets: Array, spin: Array, h: float
 
 
 def ground(
-    body: Body, matrices: Array, height: Array, velocity: Array, spin: Array, sizes: Array, gravity: float, h: float
-) -> tuple[Inertia, Push]:
+    body: Body, matrices: Array, height: Array, velocity: Array, spin: Array, sizes: Array, gravity: float, h: float,
+    constants: Constants,
+) -> tuple[Inertia, Push]:  # fmt: skip
     """What the ends of links that touch the ground add to inertia and push within `h` [s].
 
     matrices (n, 3, 3, B) and height (n, 1, B) [m] of the links. Where an end is in the ground, the damped spring of the
@@ -270,8 +290,8 @@ def ground(
         slip = jnp.sqrt(jnp.sum(sliding**2, axis=1, keepdims=True) + 1e-8)
         sticks = slip * (damped - 1.0) / damped <= surface.friction * pressed
         along = upright - surface.friction * sliding / slip
-        loosely = HELD_LOOSELY_BY * along[:, :, None] * along[:, None]
-        hold = (mass * touching)[:, None] * jnp.where(sticks[:, None], HELD_BY * unit, loosely)
+        loosely = constants.sliding * along[:, :, None] * along[:, None]
+        hold = (mass * touching)[:, None] * jnp.where(sticks[:, None], constants.standing * unit, loosely)
         target = mv(hold, sliding / damped + wanted * upright)
         mixed = cross_columns(arm, hold)
         return Inertia(-cross_rows(mixed, arm), mixed, hold), Push(cross(arm, target), target)

@@ -1,80 +1,112 @@
-"""f_d and f_c: multi-layer perceptrons with ELU, and the configurations they come in."""
+"""Multi-layer perceptrons with ELU, what normalises their inputs and outputs, and the weights that they hold."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 
-@dataclass(frozen=True)
-class Config:
-    """What distinguishes one learned simulator from another.
+class Statistics(NamedTuple):
+    """Mean and spread of a feature vector (F,), from data; features that never vary keep spread 1."""
 
-    frame: the dynamics network sees the world's axes, or those of the body's heading. predict: it gives the next
-    velocity, integrated semi-implicitly as in the paper, or the change of velocity and a correction of the trapezoidal
-    step. contact: the contact network gives a free feature vector that the dynamics networks see, or an impulse along
-    the contact's own directions, which balls take up directly and to which articulated bodies have a network of their
-    own, of the contact network's size, that adds to the dynamics network's change. skip: residual connections. aided:
-    the networks also see what they would else have to find out from rotations: the torques of the servos and how the
-    ends of the links are to the ground. base: the dynamics network of an articulated body adds to nothing, or to what
-    mechanics says of a body alone on the ground.
+    mean: Array
+    spread: Array
+
+    @staticmethod
+    def of(samples: Array, weight: Array | None = None) -> Statistics:
+        """Statistics of samples (N, F), each counted by its weight (N,)."""
+        share = jnp.ones(samples.shape[0]) if weight is None else weight
+        share = (share / share.sum())[:, None]
+        mean = jnp.sum(share * samples, axis=0)
+        spread = jnp.sqrt(jnp.sum(share * (samples - mean) ** 2, axis=0))
+        return Statistics(mean, jnp.where(spread > 1e-5, spread, 1.0))
+
+    def normalise(self, features: Array) -> Array:
+        """Features (*, F) in standard deviations from the mean."""
+        return (features - self.mean) / self.spread
+
+    def restore(self, outputs: Array) -> Array:
+        """Outputs (*, F) in their own units."""
+        return outputs * self.spread + self.mean
+
+
+Measured = dict[str, tuple[Statistics, Statistics | None]]
+"""Statistics of a network's inputs and, where they are changes of state, of its outputs, by its name."""
+
+
+class Weights(NamedTuple):
+    """Everything that is learned or measured: parameters and statistics by network.
+
+    networks: {"dynamics/human": flax parameters, "contact/human-ball": ...}. inputs: Statistics by the same names.
+    outputs: those of the networks whose outputs are changes of state.
     """
 
-    name: str
+    networks: dict[str, Any]
+    inputs: dict[str, Statistics]
+    outputs: dict[str, Statistics]
+
+
+@dataclass(frozen=True)
+class Size:
+    """Of a perceptron: how many dense layers, and how wide those before the last are.
+
+    skip: residual connections. reach: inputs are held within so many standard deviations.
+    """
+
     layers: int
     width: int
-    contact_layers: int
-    contact_width: int
-    ball_layers: int
-    ball_width: int
-    frame: Literal["world", "heading"]
-    predict: Literal["velocity", "change"]
-    contact: Literal["feature", "impulse"]
-    skip: bool
-    aided: bool
-    base: Literal["nothing", "mechanics"] = "nothing"
+    skip: bool = True
+    reach: float = 10.0
 
     def __post_init__(self) -> None:
-        for field in ("layers", "width", "contact_layers", "contact_width", "ball_layers", "ball_width"):
+        for field in ("layers", "width"):
             value = getattr(self, field)
             if not (isinstance(value, int) and value >= 1):
-                raise ValueError(f"config.{field} is {value!r}, but must be an integer of at least 1")
-        for field, choices in (
-            ("frame", ("world", "heading")),
-            ("predict", ("velocity", "change")),
-            ("contact", ("feature", "impulse")),
-            ("base", ("nothing", "mechanics")),
-        ):
-            if getattr(self, field) not in choices:
-                raise ValueError(f"config.{field} is {getattr(self, field)!r}, but must be one of {choices}")
+                raise ValueError(f"size.{field} is {value!r}, but must be an integer of at least 1")
 
-
-PAPER = Config("paper", 12, 512, 6, 128, 12, 128, "world", "velocity", "feature", skip=False, aided=False)
-COMPACT = Config("compact", 6, 256, 4, 128, 2, 32, "heading", "change", "impulse", skip=True, aided=True)
-HYBRID = Config(
-    "hybrid", 5, 128, 4, 128, 2, 32, "heading", "change", "impulse", skip=True, aided=True, base="mechanics"
-)
-CONFIGS = {config.name: config for config in (PAPER, COMPACT, HYBRID)}
+    def network(self, outputs: int) -> Perceptron:
+        """The perceptron with so many outputs."""
+        return Perceptron(self.layers, self.width, outputs, self.skip, self.reach)
 
 
 class Perceptron(nn.Module):
-    """`layers` dense layers of `width` with ELU between them, the last one giving `outputs` values."""
+    """`layers` dense layers of `width` with ELU between them, the last one giving `outputs` values; see `Size`."""
 
     layers: int
     width: int
     outputs: int
     skip: bool
+    reach: float
 
     @nn.compact
     def __call__(self, inputs: Array) -> Array:
         """(*, F) -> (*, outputs)."""
-        hidden = inputs
+        hidden = jnp.clip(inputs, -self.reach, self.reach)
         for index in range(self.layers - 1):
             new = jax.nn.elu(nn.Dense(self.width)(hidden))
             hidden = hidden + new if self.skip and index else new
         last = nn.initializers.variance_scaling(0.01, "fan_in", "truncated_normal")
         return nn.Dense(self.outputs, kernel_init=last)(hidden)
+
+
+def evaluate(network: Perceptron, weights: Weights, name: str, inputs: Array) -> Array:
+    """Outputs (*, O) of a network for its inputs (*, F), normalised first."""
+    outputs = network.apply(weights.networks[name], weights.inputs[name].normalise(inputs))
+    assert isinstance(outputs, jax.Array)
+    return outputs
+
+
+def bounded(outputs: Array, bounds: tuple[float, ...] | float) -> Array:
+    """Outputs (*, O) within +-bounds, smoothly, and unchanged near zero."""
+    limit = jnp.asarray(bounds, outputs.dtype)
+    return limit * jnp.tanh(outputs / limit)
+
+
+def side_by_side(*parts: Array) -> Array:
+    """Features (B, ...) as one vector (B, F)."""
+    return jnp.concatenate([part.reshape(part.shape[0], -1) for part in parts], axis=-1)

@@ -6,8 +6,11 @@ Quaternions are (*, 4), w first. Everything here has finite gradients at zero an
 from __future__ import annotations
 
 import brax.math
+import jax
 import jax.numpy as jnp
 from jax import Array
+
+from larp_model import state as packed
 
 multiply = jnp.vectorize(brax.math.quat_mul, signature="(4),(4)->(4)")
 matrix = jnp.vectorize(brax.math.quat_to_3x3, signature="(4)->(3,3)")
@@ -83,3 +86,23 @@ def about_z(vector: Array, turn: Array) -> Array:
 def opposite(turn: Array) -> Array:
     """Cosine and sine (*, 2) of the opposite angle."""
     return turn * jnp.array([1.0, -1.0], turn.dtype)
+
+
+def random_turns(key: Array, count: int) -> Array:
+    """Cosines and sines (count, 2) of uniform turns about z."""
+    angle = jax.random.uniform(key, (count,), maxval=2.0 * jnp.pi)
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+
+
+def turn_states(state: Array, turn: Array) -> Array:
+    """States (*, L, 13) turned about the world's z by `turn` (*, 2)."""
+    turn = turn[..., None, :]
+    half = jnp.arctan2(turn[..., 1], turn[..., 0]) / 2.0
+    zero = jnp.zeros_like(half)
+    quaternion = jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)], axis=-1)
+    return packed.pack(
+        about_z(packed.position(state), turn),
+        multiply(quaternion, packed.orientation(state)),
+        about_z(packed.velocity(state), turn),
+        about_z(packed.angular_velocity(state), turn),
+    )

@@ -8,7 +8,7 @@ engine: the truth, the learned model, the planner and the viewer all read the sa
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -222,22 +222,21 @@ class Scene:
 
     def rows(self, name: str) -> slice:
         """The rows of a body in the state."""
-        start = 0
-        for body in self.bodies:
-            if body.name == name:
-                return slice(start, start + len(body.links))
-            start += len(body.links)
-        raise ValueError(f"scene has no body {name!r}; it has {[body.name for body in self.bodies]}")
+        return self._slice(name, lambda body: len(body.links))
+
+    def joint_rows(self, name: str) -> slice:
+        """The rows of a body's joints among all joints."""
+        return self._slice(name, lambda body: len(body.joints))
 
     def motor_rows(self, name: str) -> slice:
         """The rows of a body in the control."""
-        start = 0
-        for body in self.bodies:
-            count = len(body.motors)
-            if body.name == name:
-                return slice(start, start + count)
-            start += count
-        raise ValueError(f"scene has no body {name!r}; it has {[body.name for body in self.bodies]}")
+        return self._slice(name, lambda body: len(body.motors))
+
+    def _slice(self, name: str, count: Callable[[Body], int]) -> slice:
+        start, body = 0, self.body(name)
+        for each in self.bodies[: self.bodies.index(body)]:
+            start += count(each)
+        return slice(start, start + count(body))
 
     def index(self, body: str, link: str) -> int:
         """The row of a link in the state."""

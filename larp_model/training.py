@@ -18,11 +18,12 @@ import orbax.checkpoint as ocp
 from jax import Array
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from larp_model import features, losses
+from larp_model import losses, meeting, rotation
 from larp_model.losses import LossWeights
-from larp_model.networks import Config
+from larp_model.networks import Weights
+from larp_model.parts.part import Model, initial_weights, measure
 from larp_model.scene import Scene
-from larp_model.simulator import Weights, initial_weights, measure, rollout
+from larp_model.simulator import rollout
 
 
 class Trajectories(Protocol):
@@ -137,24 +138,22 @@ class Windows:
 
 
 def first_contacts(scene: Scene, episodes: Trajectories, chunk: int = 512) -> np.ndarray:
-    """`features.first_contact` (E,) of many trajectories, chunk by chunk."""
-    found, count = jax.jit(partial(features.first_contact, scene)), len(episodes.states)
+    """`meeting.first_contact` (E,) of many trajectories, chunk by chunk."""
+    found, count = jax.jit(partial(meeting.first_contact, scene)), len(episodes.states)
     rows = np.minimum(np.arange(count + -count % chunk), count - 1).reshape(-1, chunk)
     return np.concatenate([found(episodes.states[each], episodes.morphology[each]) for each in rows])[:count]
 
 
-def statistics_of(
-    scene: Scene, config: Config, windows: Windows, random: np.random.Generator, batches: int = 32
-) -> Weights:
+def statistics_of(model: Model, windows: Windows, random: np.random.Generator, batches: int = 32) -> Weights:
     """Fresh weights, their statistics measured on single true steps drawn as in training."""
     drawn = [windows.draw(random, 2) for _ in range(batches)]
     states, controls, torques, morphology = (np.concatenate(column) for column in zip(*drawn, strict=True))
-    turns = features.random_turns(jax.random.key(int(random.integers(2**31))), len(states))
-    if config.frame == "world":
-        states = np.asarray(features.turn_states(jnp.asarray(states), turns[:, None]))
+    turns = rotation.random_turns(jax.random.key(int(random.integers(2**31))), len(states))
+    if not model.invariant:
+        states = np.asarray(rotation.turn_states(jnp.asarray(states), turns[:, None]))
     step = states[:, 0], states[:, 1], controls[:, 0], torques[:, 0], morphology
-    found = jax.jit(partial(measure, scene, config))(*step)
-    return initial_weights(scene, config, jax.random.key(int(random.integers(2**31))), found)
+    found = jax.jit(partial(measure, model))(*step)
+    return initial_weights(model, jax.random.key(int(random.integers(2**31))), found)
 
 
 def emphasis(scene: Scene, recipe: Recipe) -> Array:
@@ -173,8 +172,7 @@ def optimiser(recipe: Recipe) -> optax.GradientTransformation:
 
 
 def train(
-    scene: Scene,
-    config: Config,
+    model: Model,
     recipe: Recipe,
     sources: Sequence[tuple[Trajectories, float]],
     folder: Path,
@@ -187,8 +185,8 @@ def train(
     of fresh ones. Where a hundred batches in a row are dropped, the last good weights are returned and the log says so.
     """
     random = np.random.default_rng(recipe.seed)
-    windows = Windows(scene, sources, recipe)
-    weights = statistics_of(scene, config, windows, random) if start is None else start
+    scene, windows = model.scene, Windows(model.scene, sources, recipe)
+    weights = statistics_of(model, windows, random) if start is None else start
     transform = optimiser(recipe)
     fixed = {name: value for name, value in weights.networks.items() if not name.startswith(recipe.only or "")}
     trained = {name: value for name, value in weights.networks.items() if name not in fixed}
@@ -204,7 +202,7 @@ def train(
 
     def loss_of(networks: dict[str, Any], states: Array, drawn: Any) -> tuple[Array, dict[str, Array]]:
         predicted = rollout(
-            scene, config, weights._replace(networks=fixed | networks), states[:, 0], drawn.controls, drawn.torques,
+            model, weights._replace(networks=fixed | networks), states[:, 0], drawn.controls, drawn.torques,
             drawn.morphology, stop_gradient=recipe.stop_gradient,
         )  # fmt: skip
         return losses.total(scene, recipe.loss, weigh, predicted, states[:, 1:], drawn.morphology)
@@ -214,10 +212,10 @@ def train(
         networks: dict[str, Any], state: Any, key: Array, drawn: Any
     ) -> tuple[dict[str, Any], Any, dict[str, Array]]:
         states = drawn.states
-        if config.frame == "world":
-            turn = features.random_turns(key, len(states))
-            states = features.turn_states(states, turn[:, None])
-            drawn = drawn._replace(torques=features.rotation.about_z(drawn.torques, turn[:, None, None]))
+        if not model.invariant:
+            turn = rotation.random_turns(key, len(states))
+            states = rotation.turn_states(states, turn[:, None])
+            drawn = drawn._replace(torques=rotation.about_z(drawn.torques, turn[:, None, None]))
         (loss, terms), gradient = jax.value_and_grad(loss_of, has_aux=True)(networks, states, drawn)
         norm = optax.tree.norm(gradient)
         good = jnp.isfinite(norm) & (norm < recipe.drop)

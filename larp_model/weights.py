@@ -1,13 +1,13 @@
-"""Weights on disk: tensors as safetensors, and a manifest that says what they are and how they came to be."""
+"""Weights on disk: tensors as safetensors, and a manifest that says of which parts they are and how they came to be."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,20 +15,75 @@ import numpy as np
 from safetensors.numpy import load as parse
 from safetensors.numpy import save as serialise
 
+from larp_model import mechanics, meeting
 from larp_model import state as packed
-from larp_model.features import Statistics
 from larp_model.files import write_whole
-from larp_model.networks import Config
-from larp_model.scene import Scene
-from larp_model.simulator import Weights, initial_weights, measure
+from larp_model.networks import Size, Statistics, Weights
+from larp_model.parts.articulated import Articulated, Response
+from larp_model.parts.bases import FromNothing, OverMechanics
+from larp_model.parts.contact import Contact
+from larp_model.parts.paper import PaperBody, PaperContact
+from larp_model.parts.part import BodyPart, Model, PairPart, assemble, bodies_of, initial_weights, measure
+from larp_model.parts.sphere import Sphere
+from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface
 
-VERSION = 1
+VERSION = 2
 SHIPPED = Path(__file__).parent / "weights"
+# What a manifest may speak of, by the name that it gives it.
+KINDS: dict[str, Any] = {
+    "articulated": Articulated,
+    "body": Body,
+    "contact": Contact,
+    "from nothing": FromNothing,
+    "joint": Joint,
+    "link": Link,
+    "mechanics": mechanics.Constants,
+    "meeting": meeting.Constants,
+    "motor": Motor,
+    "over mechanics": OverMechanics,
+    "pair": Pair,
+    "paper's body": PaperBody,
+    "paper's contact": PaperContact,
+    "response": Response,
+    "size": Size,
+    "sphere": Sphere,
+    "surface": Surface,
+}
+NAMES = {kind: name for name, kind in KINDS.items()}
 
 
-def signature(scene: Scene) -> str:
-    """A digest of everything in the scene that the weights depend on."""
-    return hashlib.sha256(json.dumps(dataclasses.asdict(scene), sort_keys=True).encode()).hexdigest()[:16]
+class Trained(NamedTuple):
+    """The sizes of links that a body's part has learned from, by rows of (length, radius, mass), (n, 3) each."""
+
+    lowest: np.ndarray
+    highest: np.ndarray
+
+
+def trained_on(scene: Scene, morphology: np.ndarray) -> dict[str, Trained]:
+    """What episodes of a morphology (E, L, 3) teach of every kind of body."""
+    found: dict[str, list[np.ndarray]] = {}
+    for body in scene.bodies:
+        found.setdefault(body.kind, []).append(morphology[:, scene.rows(body.name)])
+    return {
+        kind: Trained(np.concatenate(sizes).min(axis=0), np.concatenate(sizes).max(axis=0))
+        for kind, sizes in found.items()
+    }
+
+
+def encode(value: Any) -> Any:
+    """A part, and all that it is made of, as JSON holds it."""
+    if dataclasses.is_dataclass(value):
+        fields = {field.name: encode(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        return {"type": NAMES[type(value)], **fields}
+    return [encode(each) for each in value] if isinstance(value, tuple) else value
+
+
+def decode(value: Any) -> Any:
+    """What `encode` made this of."""
+    if isinstance(value, dict):
+        fields = {name: decode(each) for name, each in value.items() if name != "type"}
+        return KINDS[value["type"]](**fields)
+    return tuple(decode(each) for each in value) if isinstance(value, list) else value
 
 
 def flatten(weights: Weights) -> dict[str, Any]:
@@ -64,58 +119,122 @@ def unflatten(arrays: Mapping[str, np.ndarray]) -> Weights:
     )
 
 
-def save(folder: Path, name: str, scene: Scene, config: Config, weights: Weights, recipe: Mapping[str, Any]) -> Path:
+def save(
+    folder: Path, name: str, model: Model, weights: Weights, recipe: Mapping[str, Any],
+    morphology: np.ndarray | None = None,
+) -> Path:  # fmt: skip
     """Write `name`.safetensors and `name`.json into the folder, each whole or not at all; returns the manifest's path.
 
-    recipe: how and on what the weights were trained, and their scores; anything JSON holds.
+    recipe: how and on what the weights were trained, and their scores; anything JSON holds. morphology: (E, L, 3) of
+    what they were trained on; the scene's by default.
     """
     arrays = {name: np.ascontiguousarray(array, np.float32) for name, array in flatten(weights).items()}
     tensors = serialise(arrays)
+    sizes = np.asarray(model.scene.morphology[None] if morphology is None else morphology, np.float64)
+    trained = {
+        kind: {name: np.round(each, 6).tolist() for name, each in found._asdict().items()}
+        for kind, found in trained_on(model.scene, sizes).items()
+    }
     manifest = {
         "version": VERSION,
-        "config": dataclasses.asdict(config),
-        "scene": signature(scene),
+        "parts": [encode(part) for part in model.parts],
+        "trained on": trained,
         "sha256": hashlib.sha256(tensors).hexdigest(),
         "recipe": recipe,
     }
     # Tensors first: a crash between the two leaves a manifest whose hash refuses them, not a silent mixture.
     write_whole(folder / f"{name}.safetensors", tensors)
-    write_whole(folder / f"{name}.json", (json.dumps(manifest, indent=2) + "\n").encode())
+    write_whole(folder / f"{name}.json", (json.dumps(manifest, indent=1) + "\n").encode())
     return folder / f"{name}.json"
 
 
-def load(manifest: Path, scene: Scene) -> tuple[Config, Weights, dict[str, Any]]:
-    """Config, weights and the whole manifest; refuses what is missing, damaged or made for another scene."""
+def load(manifest: Path, scene: Scene) -> tuple[Model, Weights, dict[str, Any]]:
+    """The scene's model, its weights and the whole manifest; refuses what is missing, damaged or does not fit."""
     tensors_path = manifest.with_suffix(".safetensors")
     for path in (manifest, tensors_path):
         if not path.is_file():
             raise ValueError(f"weights file {path} does not exist")
     try:
         content = dict(json.loads(manifest.read_text()))
-        version = content["version"]
-        config = Config(**content["config"]) if version == VERSION else None
-        expected, made_for = content["sha256"], content["scene"]
-    except (ValueError, KeyError, TypeError) as error:
+        version, expected = content["version"], content["sha256"]
+        known = version == VERSION
+        parts = [decode(part) for part in content["parts"]] if known else []
+        trained = {
+            kind: Trained(*(np.array(sizes[name], float).reshape(-1, 3) for name in Trained._fields))
+            for kind, sizes in (content["trained on"] if known else {}).items()
+        }
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"weights manifest {manifest} cannot be read: {type(error).__name__}: {error}") from None
-    if config is None:
+    if not known:
         raise ValueError(f"weights {manifest} are of version {version!r}, but {VERSION} is needed")
-    if made_for != signature(scene):
-        raise ValueError(f"weights {manifest} were made for scene {made_for!r}, but this scene is {signature(scene)!r}")
+    try:
+        model = assemble(scene, parts)
+    except ValueError as error:
+        raise ValueError(f"weights {manifest}: {error}; train some with `python -m tasks.train`") from None
+    for part in parts:
+        for difference in differences(part, scene, trained):
+            raise ValueError(f"weights {manifest} do not fit the scene: {difference}")
     raw = tensors_path.read_bytes()
     if hashlib.sha256(raw).hexdigest() != expected:
         raise ValueError(f"weights file {tensors_path} is damaged: its sha256 is not the one in {manifest.name}")
-    arrays = parse(raw)
-    _check_shapes(tensors_path, arrays, shapes(scene, config))
-    return config, unflatten(arrays), content
+    wanted = model.networks()
+    arrays = {name: array for name, array in parse(raw).items() if name.split(":")[1] in wanted}
+    _check_shapes(tensors_path, arrays, shapes(model))
+    return model, unflatten(arrays), content
 
 
-def shapes(scene: Scene, config: Config) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of the tensors of a scene's weights."""
+def differences(part: BodyPart | PairPart, scene: Scene, trained: Mapping[str, Trained]) -> Iterator[str]:
+    """In what the scene, where it needs the part, is not what that was trained for, each in a few words."""
+    for own in bodies_of(part):
+        for body in scene.bodies:
+            if body.kind == own.kind:
+                yield from _bodies_differ(body, own, trained[own.kind])
+    for name in ("dt", "gravity"):
+        was, now = getattr(part, name, None), getattr(scene, name)
+        if was is not None and was != now:
+            yield f"its {name} is {now}, but they were trained with {was}"
+    for pair in scene.pairs:
+        kinds = [scene.body(name).kind for name in (pair.first, pair.second)]
+        if hasattr(part, "pair") and kinds == [body.kind for body in bodies_of(part)]:
+            for name in ("first_links", "second_links", "surface"):
+                yield from _differ(f"{pair.first}-{pair.second}.{name}", getattr(pair, name), getattr(part.pair, name))
+
+
+def _bodies_differ(body: Body, own: Body, trained: Trained) -> Iterator[str]:
+    """Links' sizes may be any between those trained on."""
+    yield from _differ(f"{body.name}.links", len(body.links), len(own.links))
+    for link, was, lowest, highest in zip(body.links, own.links, *trained, strict=True):
+        yield from _differ(f"{body.name}.{link.name}.axis", link.axis, was.axis)
+        yield from _differ(f"the name of {body.name}.{link.name}", link.name, was.name)
+        for name, low, high in zip(("length", "radius", "mass"), lowest, highest, strict=True):
+            value = getattr(link, name)
+            if not low * (1.0 - 1e-5) - 1e-6 <= value <= high * (1.0 + 1e-5) + 1e-6:
+                span = f"{low:.6g}" if low == high else f"{low:.6g} to {high:.6g}"
+                yield f"{body.name}.{link.name}.{name} is {value:.6g}, but they were trained on {span}"
+    for joint, before, link in zip(body.joints, own.joints, body.links[1:], strict=True):
+        yield from _differ(f"the joint of {body.name}.{link.name}", joint, before)
+    yield from _differ(f"{body.name}.surface", body.surface, own.surface)
+
+
+def _differ(what: str, now: Any, was: Any) -> Iterator[str]:
+    """The fields in which two things differ, or the things where they have none."""
+    if now == was:
+        return
+    if dataclasses.is_dataclass(now) and dataclasses.is_dataclass(was):
+        for field in dataclasses.fields(now):
+            yield from _differ(f"{what}.{field.name}", getattr(now, field.name), getattr(was, field.name))
+    else:
+        yield f"{what} is {now}, but they were trained with {was}"
+
+
+def shapes(model: Model) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of the tensors of a model's weights."""
+    scene = model.scene
 
     def make() -> Weights:
         state = jnp.zeros((1, len(scene.links), packed.SIZE))
         control, torque = jnp.zeros((1, len(scene.motors), 3)), jnp.zeros((1, len(scene.links), 3))
-        return initial_weights(scene, config, jax.random.key(0), measure(scene, config, state, state, control, torque))
+        return initial_weights(model, jax.random.key(0), measure(model, state, state, control, torque))
 
     return {name: tensor.shape for name, tensor in flatten(jax.eval_shape(make)).items()}
 
@@ -123,8 +242,8 @@ def shapes(scene: Scene, config: Config) -> dict[str, tuple[int, ...]]:
 def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray], needed: Mapping[str, tuple[int, ...]]) -> None:
     if set(arrays) != set(needed):
         odd = sorted(set(arrays) ^ set(needed))
-        raise ValueError(f"weights file {path} and its config differ in the tensors {odd}")
+        raise ValueError(f"weights file {path} and its manifest differ in the tensors {odd}")
     for name, shape in needed.items():
         found = arrays[name].shape
         if found != shape:
-            raise ValueError(f"weights file {path}: {name} has shape {found}, but its config needs {shape}")
+            raise ValueError(f"weights file {path}: {name} has shape {found}, but its part needs {shape}")

@@ -7,8 +7,9 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from larp_model import features
 from larp_model import state as packed
+from larp_model.kinematics import morphology_of
+from larp_model.meeting import meetings
 from larp_model.scene import Link, Scene
 from larp_model.training import first_contacts
 from larp_model.truth.episodes import Episodes, record
@@ -135,9 +136,9 @@ def overlaps(scene: Scene, states: np.ndarray, morphology: np.ndarray | None = N
 
     morphology: (N, L, 3); the scene's by default.
     """
-    sizes = features.morphology_of(scene)[None] if morphology is None else jnp.asarray(morphology, jnp.float32)
+    sizes = morphology_of(scene)[None] if morphology is None else jnp.asarray(morphology, jnp.float32)
     still = jnp.asarray(states)
-    gaps = [features.contact_inputs(scene, pair, still, still, sizes).gap for pair in scene.pairs]
+    gaps = [met.gap for _, met in meetings(scene, still, sizes)]
     return np.asarray(jnp.concatenate(gaps, axis=1).min(axis=1) < 0.0)
 
 

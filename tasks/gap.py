@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from larp_model import features
 from larp_model import state as packed
+from larp_model.kinematics import morphology_of
+from larp_model.meeting import meetings
 from larp_model.scene import Scene
 
 # The ball has been struck when it is faster than this [m/s]; its launch is read so many steps later.
@@ -41,20 +42,19 @@ def events(scene: Scene, states: np.ndarray, untouched: np.ndarray | None = None
     contact = contact_step(states, untouched)
     if not contact:
         return none
-    pair, ball = scene.pairs[0], states[:, -1]
+    ball = states[:, -1]
     radius = scene.links[-1].radius
     before = jnp.asarray(states[contact - 1 : contact])
-    touch = features.contact_inputs(scene, pair, before, before, features.morphology_of(scene)[None])
-    nearest = int(np.argmin(np.asarray(touch.gap[0] - touch.near[0])))
-    first, _ = features.pair_rows(scene, pair)
+    [(pair, met)] = meetings(scene, before, morphology_of(scene)[None])
+    nearest = int(np.argmin(np.asarray(met.gap[0] - met.near[0])))
     launch = ball[min(contact + LAUNCH_STEPS, len(ball) - 1), packed.VELOCITY]
     height = ball[contact:, 2] - radius
     flying = height > FLYING
     down = np.flatnonzero((height < LANDED) & (np.cumsum(flying) > 0))
     return none | {
         "contact_s": contact * scene.dt,
-        "contact_link": scene.links[first[nearest]].name,
-        "contact_point_m": _list(-radius * np.asarray(touch.normal[0, nearest])),
+        "contact_link": pair.first_links[nearest // len(pair.second_links)],
+        "contact_point_m": _list(-radius * np.asarray(met.normal[0, nearest])),
         "launch_m_s": _list(launch),
         "landing_m": _list(ball[contact + down[0], :2]) if len(down) else None,
     }

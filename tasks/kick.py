@@ -304,10 +304,10 @@ def models_of(
 
     def model(*bodies: str) -> Dynamics:
         part = scene.only(*bodies)
-        return MujocoDynamics(Truth(part, rows, substeps)) if name == "mujoco" else Simulator(part, config, learned)
+        return MujocoDynamics(Truth(part, rows, substeps)) if name == "mujoco" else Simulator(learned.on(part), tensors)
 
     if name == "larp":
-        config, learned, manifest = stored.load(weights, trained_on or scene)
+        learned, tensors, manifest = stored.load(weights, trained_on or scene)
         used = manifest["sha256"][:12]
     elif name == "mujoco":
         used = "none"

@@ -20,11 +20,12 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from larp_model import evaluation, networks, training
+from larp_model import designs, evaluation, training
 from larp_model import weights as stored
 from larp_model.losses import LossWeights
+from larp_model.networks import Weights
 from larp_model.scene import Scene
-from larp_model.simulator import Simulator, Weights
+from larp_model.simulator import Simulator
 from larp_model.truth import episodes as truth_episodes
 from larp_model.truth.episodes import Episodes
 from larp_model.truth.mujoco import SUBSTEPS, Truth
@@ -150,7 +151,7 @@ def main(
     remember_compilations()
     kick = prepare() if chosen.name == WEIGHTS else None
     stages = GENERAL if kick is None else KICK
-    config = networks.COMPACT if kick else networks.HYBRID
+    model = (designs.compact if kick else designs.hybrid)(chosen.scene)
     random = stored_episodes(folder / "random.npz", chosen.scene, lambda: chosen.draw(episodes, seed), console)
     sources = [random]
     if chosen.strikes:
@@ -159,6 +160,11 @@ def main(
     learned: Weights | None = None
     rounds: list[dict[str, Any]] = []
     manifest = Path()
+
+    def save(into: Path, recipe: dict[str, Any]) -> Path:
+        assert learned is not None
+        return stored.save(into, chosen.name, model, learned, recipe, random.morphology)
+
     for number, stage in enumerate(stages):
         if stage.adds and kick is not None:
             later = seed + 1000 * number
@@ -177,7 +183,7 @@ def main(
         used = [(source, 1.0) for source in sources if source.steps >= longest]
         updates = max(1, round(effort * stage.recipe.updates))
         recipe = replace(stage.recipe, updates=updates, seed=seed + number)
-        learned, log = training.train(chosen.scene, config, recipe, used, folder / stage.name, learned)
+        learned, log = training.train(model, recipe, used, folder / stage.name, learned)
         rounds = [
             *rounds,
             {
@@ -190,11 +196,11 @@ def main(
                 "last": log["history"][-1] if log["history"] else None,
             },
         ]
-        stored.save(folder / stage.name, chosen.name, chosen.scene, config, learned, {"rounds": rounds})
+        save(folder / stage.name, {"rounds": rounds})
         console.print(f"{stage.name}: {log['seconds']:.0f} s, {log['dropped']} batches dropped")
     assert learned is not None
     held_out, _ = chosen.draw(256, EVALUATION_SEED)
-    scores = evaluation.evaluate(Simulator(chosen.scene, config, learned), held_out, chosen.windows)
+    scores = evaluation.evaluate(Simulator(model, learned), held_out, chosen.windows)
     recipe_of = {
         "rounds": rounds,
         "truth": {"engine": "mujoco", "substeps": SUBSTEPS, "dt": chosen.scene.dt},
@@ -202,7 +208,7 @@ def main(
         "scores": {"seed": EVALUATION_SEED, **scores},
     }
     console.print_json(json.dumps(scores))
-    written = stored.save(out or folder / "weights", chosen.name, chosen.scene, config, learned, recipe_of)
+    written = save(out or folder / "weights", recipe_of)
     console.print(f"weights: {written}")
 
 

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from larp_model import designs
 from larp_model.bodies import human_and_ball
-from larp_model.networks import Config
+from larp_model.networks import Weights
+from larp_model.parts.part import Model
 from larp_model.scene import Scene
-from larp_model.simulator import Weights
 from larp_model.training import Recipe, Windows, statistics_of
 from larp_model.truth.episodes import Episodes
 from tasks.data import random_episodes
@@ -40,31 +41,31 @@ def episodes(scene: Scene, reference: Reference) -> Episodes:
 
 
 @pytest.fixture(scope="session")
-def compact() -> Config:
+def compact(scene: Scene) -> Model:
     """The shipped kind of model, as small as it can be."""
-    return Config("tiny", 2, 16, 2, 16, 2, 16, "heading", "change", "impulse", skip=True, aided=True)
+    return designs.compact(scene, designs.TINY)
 
 
 @pytest.fixture(scope="session")
-def paper() -> Config:
+def paper(scene: Scene) -> Model:
     """The paper's kind of model, as small as it can be."""
-    return Config("tiny_paper", 2, 16, 2, 16, 2, 16, "world", "velocity", "feature", skip=False, aided=False)
+    return designs.paper(scene, designs.TINY)
 
 
-def random_weights(scene: Scene, config: Config, episodes: Episodes) -> Weights:
+def random_weights(model: Model, episodes: Episodes) -> Weights:
     """Untrained weights with statistics of the truth."""
     with jax.enable_x64(False):
-        windows = Windows(scene, [(episodes, 1.0)], Recipe(batch=64))
-        return statistics_of(scene, config, windows, np.random.default_rng(0), batches=2)
+        windows = Windows(model.scene, [(episodes, 1.0)], Recipe(batch=64))
+        return statistics_of(model, windows, np.random.default_rng(0), batches=2)
 
 
 @pytest.fixture(scope="session")
-def compact_weights(scene: Scene, compact: Config, episodes: Episodes) -> Weights:
+def compact_weights(compact: Model, episodes: Episodes) -> Weights:
     """Random weights of `compact`."""
-    return random_weights(scene, compact, episodes)
+    return random_weights(compact, episodes)
 
 
 @pytest.fixture(scope="session")
-def paper_weights(scene: Scene, paper: Config, episodes: Episodes) -> Weights:
+def paper_weights(paper: Model, episodes: Episodes) -> Weights:
     """Random weights of `paper`."""
-    return random_weights(scene, paper, episodes)
+    return random_weights(paper, episodes)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from larp_model import features
+from larp_model import kinematics
 from larp_model import state as packed
 from mpc import evaluate
 from tasks import kick, sensing
@@ -91,8 +91,8 @@ def test_sensing_keeps_joints_closed_and_has_the_noise_it_says(task: kick.Kick) 
     sense = sensing.noisy(task.scene, np.random.default_rng(0))
     state = task.reference.states[25].astype(float)
     seen = np.stack([sense(state) for _ in range(200)])
-    shape = features.morphology_of(task.scene)[None]
-    apart = features.displacement(task.scene, jnp.asarray(seen), shape)
+    shape = kinematics.morphology_of(task.scene)[None]
+    apart = kinematics.displacement(task.scene, jnp.asarray(seen), shape)
     assert float(jnp.abs(apart).max()) < 1e-5
     assert np.std(seen[:, task.ball, :3] - state[task.ball, :3]) == pytest.approx(sensing.BALL, rel=0.15)
     np.testing.assert_allclose(seen[:, 0, :7], np.broadcast_to(state[0, :7], (200, 7)), atol=1e-6)

@@ -9,10 +9,12 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from larp_model import features, rotation
+from larp_model import rotation
 from larp_model import state as packed
 from larp_model.bodies import chain, human_and_ball
 from larp_model.compliance import compliance, invert, moments
+from larp_model.kinematics import morphology_of
+from larp_model.meeting import rows_of
 from larp_model.scene import Body, Scene
 from larp_model.truth.mujoco import Truth, compile_model
 from tasks.references import Reference
@@ -48,17 +50,18 @@ def test_the_end_of_a_chain_gives_way_as_the_engines_inertia_says() -> None:
         mujoco.mj_fullM(model, data, inertia)
         mujoco.mj_jac(model, data, jacobian, None, state[0, -1, :3] + point, last)
         matrices = rotation.matrix(packed.orientation(jnp.asarray(state)))
-        shape = features.morphology_of(scene)[None]
-        found = compliance(scene, np.array([3]), matrices, jnp.asarray(point)[None, None], shape)[0, 0]
+        shape = morphology_of(scene)[None]
+        found = compliance(scene.bodies[0], np.array([3]), matrices, jnp.asarray(point)[None, None], shape)[0, 0]
         np.testing.assert_allclose(found, jacobian @ np.linalg.solve(inertia, jacobian.T), rtol=2e-3, atol=1e-3)
 
 
 def test_compliance_is_symmetric_positive_and_less_than_a_free_links(scene: Scene, reference: Reference) -> None:
     state = jnp.asarray(reference.states[:40:4])
-    rows, _ = features.pair_rows(scene, scene.pairs[0])
-    matrices, shape = rotation.matrix(packed.orientation(state)), features.morphology_of(scene)[None]
+    human = scene.bodies[0]
+    rows, _ = rows_of(scene.pairs[0], human, scene.bodies[1])
+    matrices, shape = rotation.matrix(packed.orientation(state)), morphology_of(scene)[None]
     points = jnp.asarray(np.random.default_rng(0).uniform(-0.1, 0.1, (10, len(rows), 3)), jnp.float32)
-    found = np.asarray(compliance(scene, rows, matrices, points, shape))
+    found = np.asarray(compliance(human, rows, matrices, points, shape))
     np.testing.assert_allclose(found, found.swapaxes(-1, -2), atol=1e-3)
     values = np.linalg.eigvalsh(found)
     assert (values > 0.0).all()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
 from types import SimpleNamespace
 
 import jax
@@ -18,10 +17,12 @@ from mujoco.mjx._src.collision_primitive import capsule_capsule
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from larp_model import contact, features
+from larp_model import contact
 from larp_model import state as packed
 from larp_model.bodies import BALL_SURFACE
 from larp_model.contact import Closest, Segment
+from larp_model.kinematics import morphology_of
+from larp_model.meeting import Meeting, gatherings, meetings, within_reach
 from larp_model.scene import Scene, Surface, Vector
 
 closest = jax.jit(contact.closest)
@@ -241,14 +242,18 @@ def test_a_foot_that_crosses_the_ball_within_a_step_is_seen(scene: Scene) -> Non
     state[0, foot, packed.POSITION] = 0.0, -0.2, 0.11  # its axis is x, it moves across
     state[0, ball, packed.POSITION] = 0.0, 0.0, 0.11
     gap = 0.2 - scene.links[foot].radius - scene.links[ball].radius
-    seen = jax.jit(partial(features.contact_inputs, scene, scene.pairs[0]))
+
+    @jax.jit
+    def seen(state: Array, free: Array) -> Meeting:
+        return meetings(scene, state, morphology_of(scene)[None], free)[0][1]
+
     touches = []
     for speed in (16.0, 0.9 * gap / scene.dt):
         state[0, foot, packed.VELOCITY] = 0.0, speed, 0.0
-        touches.append(seen(jnp.asarray(state), jnp.asarray(state), features.morphology_of(scene)[None]))
+        touches.append(seen(jnp.asarray(state), jnp.asarray(state)))
     free = state.copy()
     free[0, foot, packed.VELOCITY] *= 1.5  # it speeds up, and arrives after all
-    touches.append(seen(jnp.asarray(state), jnp.asarray(free), features.morphology_of(scene)[None]))
+    touches.append(seen(jnp.asarray(state), jnp.asarray(free)))
     fast, slow, faster = touches
     struck = scene.pairs[0].first_links.index("right_foot")
     assert fast.near[0, struck] == 1.0 and (np.delete(np.asarray(fast.near[0]), struck) == 0.0).all()
@@ -270,10 +275,14 @@ def test_links_out_of_reach_do_not_feel_each_other(scene: Scene) -> None:
         speed = random.uniform(0.0, 30.0, (count, 1, 1))
         each[..., packed.VELOCITY] = speed * random.standard_normal((*state.shape[:2], 3))
         each[..., packed.ANGULAR_VELOCITY] = 3.0 * speed * random.standard_normal((*state.shape[:2], 3))
-    shape, pair = features.morphology_of(scene)[None], scene.pairs[0]
-    reach = jax.vmap(lambda one, after: features.within_reach(scene, pair, one[None], after[None], shape))
-    within = np.asarray(jax.jit(reach)(jnp.asarray(state), jnp.asarray(free)))
-    touch = jax.jit(partial(features.contact_inputs, scene, pair))(jnp.asarray(state), jnp.asarray(free), shape)
+    shape = morphology_of(scene)[None]
+
+    def reach(one: Array, after: Array) -> Array:
+        [(_, first, second)] = gatherings(scene, one[None], shape, after[None])
+        return within_reach(first, second, scene.dt)
+
+    within = np.asarray(jax.jit(jax.vmap(reach))(jnp.asarray(state), jnp.asarray(free)))
+    [(_, touch)] = meetings(scene, jnp.asarray(state), shape, jnp.asarray(free))
     felt = np.asarray(touch.near).max(axis=1) > 0.0
     assert felt.any() and (~within).any()
     assert not (felt & ~within).any()

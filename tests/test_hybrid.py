@@ -10,20 +10,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from larp_model import evaluation, features, rotation
+from larp_model import designs, rotation
 from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.bodies import two_chains
-from larp_model.networks import Config
-from larp_model.simulator import Simulator, initial_weights, measure, rollout
+from larp_model.parts.articulated import Articulated
+from larp_model.parts.bases import OverMechanics
+from larp_model.parts.part import initial_weights, measure
+from larp_model.simulator import Simulator, rollout
 from larp_model.training import first_contacts
 from tasks.scenarios import scenario
 
 STEPS = 5
 SCENE = two_chains(2)
-TINY = Config("tiny", 2, 16, 2, 16, 2, 16, "heading", "change", "impulse", skip=True, aided=True, base="mechanics")
+MODEL = designs.hybrid(SCENE, designs.TINY)
 SOON = {"xla_backend_optimization_level": 0}
-ROLL = jax.jit(rollout, static_argnums=(0, 1), compiler_options=SOON)
+ROLL = jax.jit(rollout, static_argnums=0, compiler_options=SOON)
 
 
 @pytest.fixture(autouse=True)
@@ -50,14 +52,14 @@ def simulator(meetings: np.ndarray) -> Simulator:
     with jax.enable_x64(False):
         after = meetings + 0.1 * np.random.default_rng(0).standard_normal(meetings.shape)
         step = (each.astype(np.float32) for each in (meetings, after, np.zeros((8, 0, 3)), np.zeros((8, 4, 3))))
-        found = jax.jit(measure, static_argnums=(0, 1), compiler_options=SOON)(SCENE, TINY, *step)
-        return Simulator(SCENE, TINY, initial_weights(SCENE, TINY, jax.random.key(0), found))
+        found = jax.jit(measure, static_argnums=0, compiler_options=SOON)(MODEL, *step)
+        return Simulator(MODEL, initial_weights(MODEL, jax.random.key(0), found))
 
 
 def roll(simulator: Simulator, states: np.ndarray) -> np.ndarray:
     """Predicted states (N, STEPS, L, 13)."""
     controls = np.zeros((len(states), STEPS, 0, 3))
-    return np.asarray(ROLL(simulator.scene, simulator.config, simulator.weights, states, controls))
+    return np.asarray(ROLL(simulator.model, simulator.weights, states, controls))
 
 
 def apart(first: np.ndarray, second: np.ndarray) -> float:
@@ -66,7 +68,7 @@ def apart(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def test_chains_push_each_other(simulator: Simulator, meetings: np.ndarray) -> None:
-    alone = Simulator(SCENE.only("first"), TINY, simulator.weights)
+    alone = Simulator(MODEL.on(SCENE.only("first")), simulator.weights)
     assert apart(roll(simulator, meetings)[:, :, :2], roll(alone, meetings[:, :2])) > 0.1, (
         "else there is little to test"
     )
@@ -75,8 +77,8 @@ def test_chains_push_each_other(simulator: Simulator, meetings: np.ndarray) -> N
 def test_turning_the_world_turns_the_prediction(simulator: Simulator, meetings: np.ndarray) -> None:
     angle = np.linspace(-3.0, 3.0, len(meetings))
     turn = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
-    turned = np.asarray(features.turn_states(jnp.asarray(meetings), turn))
-    expected = features.turn_states(jnp.asarray(roll(simulator, meetings)), turn[:, None])
+    turned = np.asarray(rotation.turn_states(jnp.asarray(meetings), turn))
+    expected = rotation.turn_states(jnp.asarray(roll(simulator, meetings)), turn[:, None])
     assert apart(roll(simulator, turned), np.asarray(expected)) < 1e-7
 
 
@@ -87,7 +89,7 @@ def test_shifting_the_world_shifts_the_prediction(simulator: Simulator, meetings
 
 
 def test_how_a_capsule_has_rolled_about_its_axis_changes_nothing(simulator: Simulator, meetings: np.ndarray) -> None:
-    alone = Simulator(SCENE.only("first"), TINY, simulator.weights)
+    alone = Simulator(MODEL.on(SCENE.only("first")), simulator.weights)
     before = meetings[:, :2]
     angle = np.linspace(-2.0, 2.0, 2 * len(meetings)).reshape(len(meetings), 2, 1)
     about = rotation.from_rotation_vector(jnp.asarray(angle * np.array(SCENE.links[0].axis)))
@@ -102,26 +104,6 @@ def test_a_batch_equals_single_runs(simulator: Simulator, meetings: np.ndarray) 
 
 
 def test_what_the_base_is_survives_on_disk(simulator: Simulator, tmp_path: Path) -> None:
-    manifest = stored.save(tmp_path, "tiny", SCENE, TINY, simulator.weights, {})
-    assert stored.load(manifest, SCENE)[0].base == "mechanics"
-
-
-@pytest.mark.parametrize(
-    ("name", "bars"), [("chains1", (0.0015, 0.012)), ("chains2", (0.002, 0.018)), ("chain4", (0.002, 0.018))]
-)
-def test_the_shipped_chains_err_no_more_than_they_did(name: str, bars: tuple[float, float]) -> None:
-    chosen = scenario(name)
-    with jax.enable_x64(False):
-        config, learned, _ = stored.load(stored.SHIPPED / f"{name}.json", chosen.scene)
-        given, _ = chosen.draw(32, 3)
-        simulator = Simulator(chosen.scene, config, learned)
-        found = evaluation.predict(
-            simulator, given.states[:, 0], given.controls[:, :40], given.torques[:, :40], given.morphology
-        )
-        usual = np.broadcast_to(chosen.scene.morphology, given.morphology.shape)
-        blind = evaluation.predict(simulator, given.states[:, 0], given.controls[:, :40], given.torques[:, :40], usual)
-    error, unseen = (
-        np.linalg.norm((each - given.states[:, 1:41])[..., packed.POSITION], axis=-1) for each in (found, blind)
-    )
-    assert error.mean() < 0.8 * unseen.mean(), "the sizes of the links are minded"
-    assert error[:, :10].mean() < bars[0] and error.mean() < bars[1]
+    manifest = stored.save(tmp_path, "tiny", MODEL, simulator.weights, {})
+    part = stored.load(manifest, SCENE)[0].bodies[0]
+    assert isinstance(part, Articulated) and part.base == OverMechanics()

@@ -13,11 +13,11 @@ import pytest
 from jax import Array
 from scipy.spatial.transform import Rotation
 
-from larp_model import features, rotation
+from larp_model import kinematics, rotation
 from larp_model import state as packed
 from larp_model.bodies import capsule, chain, human, human_and_ball
 from larp_model.compliance import moments
-from larp_model.mechanics import CLOSING, Motion, free_motion
+from larp_model.mechanics import Constants, Motion, free_motion
 from larp_model.scene import Body, Scene
 from larp_model.truth.mujoco import Truth, closed
 from tasks.references import standing_on_ground
@@ -58,7 +58,7 @@ def motion_of(
     body: Body, state: Array, control: Array, torque: Array, gravity: float = 9.81, dt: float = 0.01
 ) -> Motion:
     """`free_motion` of the body as it is."""
-    return free_motion(body, state, control, torque, features.morphology_of(Scene((body,)))[None], gravity, dt)
+    return free_motion(body, state, control, torque, kinematics.morphology_of(Scene((body,)))[None], gravity, dt)
 
 
 @cache
@@ -77,7 +77,7 @@ def moved(states: np.ndarray, motion: Motion) -> np.ndarray:
 
 def momenta(body: Body, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Momentum [kg m/s] and angular momentum [kg m^2/s] about the origin, (N, 3) each."""
-    shape = np.asarray(features.morphology_of(Scene((body,))), float)
+    shape = np.asarray(kinematics.morphology_of(Scene((body,))), float)
     along, across = (np.asarray(each)[:, None] for each in moments(*shape.T))
     matrices = np.asarray(rotation.matrix(jnp.asarray(states[..., packed.ORIENTATION])))
     axis = np.einsum("nlij,lj->nli", matrices, np.array([link.axis for link in body.links]))
@@ -89,7 +89,7 @@ def momenta(body: Body, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def energy(body: Body, states: np.ndarray) -> np.ndarray:
     """Energy (N,) [J] of motion and height."""
-    length, radius, mass = np.asarray(features.morphology_of(Scene((body,))), float).T
+    length, radius, mass = np.asarray(kinematics.morphology_of(Scene((body,))), float).T
     along, across = (np.asarray(each) for each in moments(length, radius, mass))  # type: ignore[arg-type]
     matrices = np.asarray(rotation.matrix(jnp.asarray(states[..., packed.ORIENTATION])))
     axis, spin = matrices @ np.array(body.links[0].axis), states[..., packed.ANGULAR_VELOCITY]
@@ -158,7 +158,7 @@ def test_turning_the_world_turns_the_motion(body: Body) -> None:
     turn = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
     first = compiled(body)(states, controls, torques)
     turned = (
-        features.turn_states(jnp.asarray(states), turn),
+        rotation.turn_states(jnp.asarray(states), turn),
         controls,
         rotation.about_z(jnp.asarray(torques), turn[:, None]),
     )
@@ -174,12 +174,14 @@ def test_a_joint_that_came_apart_closes_by_its_share(body: Body) -> None:
     open_[:, 1:, 0] += 1e-3 * np.arange(1, len(body.links))
 
     def gaps(found: np.ndarray) -> np.ndarray:
-        return np.linalg.norm(features.displacement(scene, jnp.asarray(found), features.morphology_of(scene)), axis=-1)
+        return np.linalg.norm(
+            kinematics.displacement(scene, jnp.asarray(found), kinematics.morphology_of(scene)), axis=-1
+        )
 
     after = moved(open_, compiled(body)(open_, controls, torques))
     before = gaps(open_)
     assert before.min() > 5e-4
-    np.testing.assert_allclose(gaps(after).sum() / before.sum(), 1.0 - CLOSING, atol=0.02)
+    np.testing.assert_allclose(gaps(after).sum() / before.sum(), 1.0 - Constants().closing, atol=0.02)
 
 
 def test_a_chain_comes_to_rest_on_the_ground_and_is_given_no_energy() -> None:

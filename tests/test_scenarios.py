@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from larp_model import features
+from larp_model import kinematics
 from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.training import first_contacts
@@ -40,7 +40,7 @@ def test_episodes_are_sound_and_reach_the_longest_window(drawn: tuple[str, Episo
 
 def test_joints_hold_in_the_truth(drawn: tuple[str, Episodes]) -> None:
     scene = SCENARIOS[drawn[0]].scene
-    apart = features.displacement(scene, jnp.asarray(drawn[1].states), jnp.asarray(drawn[1].morphology[:, None]))
+    apart = kinematics.displacement(scene, jnp.asarray(drawn[1].states), jnp.asarray(drawn[1].morphology[:, None]))
     assert np.abs(apart).max(initial=0.0) < 2e-6
 
 

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from larp_model import features
+from larp_model import kinematics
 from larp_model.bodies import ball, capsule, chain, human, human_and_ball, standing_height
 from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface, anchor
 
@@ -133,7 +133,7 @@ def test_anchors_scale_with_the_morphology(length: float, radius: float) -> None
         along = np.abs(link.axis) > 0.5
         np.testing.assert_allclose(scaled, np.where(along, length, radius) * still, atol=1e-12)
         shape = jnp.array([[length * link.length, radius * link.radius, link.mass]])
-        np.testing.assert_allclose(features.anchors([point], [link.axis], shape)[0], scaled, atol=1e-6)
+        np.testing.assert_allclose(kinematics.anchors([point], [link.axis], shape)[0], scaled, atol=1e-6)
 
 
 @given(st.floats(1.2, 2.2), st.floats(30.0, 150.0))

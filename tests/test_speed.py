@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from larp_model import features
+from larp_model.kinematics import morphology_of
+from larp_model.meeting import gatherings, within_reach
 from larp_model.scene import Scene
 from larp_model.truth.mujoco import Truth
 from tasks.benchmarks import engines, replays, report, speed
@@ -23,12 +24,13 @@ def asked(engine: str = "mujoco", scene: str = "ball", reach: str | None = None,
 
 def near(what: Course) -> np.ndarray:
     """(T,) in which steps a link is near the ball, in the course as MuJoCo performs it."""
-    scene, shape = what.scene, features.morphology_of(what.scene)[None]
+    scene, shape = what.scene, morphology_of(what.scene)[None]
     after, _ = Truth(scene, len(what.states), threads=1).rollout(what.states, what.controls)
     states = np.concatenate([what.states[:, None], after], axis=1)
     times = range(what.controls.shape[1])
     pairs = [(jnp.asarray(states[:, t]), jnp.asarray(states[:, t + 1])) for t in times]
-    return np.array([features.within_reach(scene, scene.pairs[0], *pair, shape) for pair in pairs])
+    parties = [gatherings(scene, before, shape, after)[0][1:] for before, after in pairs]
+    return np.array([within_reach(*both, scene.dt) for both in parties])
 
 
 def test_a_struck_ball_is_near_a_link_in_every_timed_step() -> None:

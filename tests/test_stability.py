@@ -13,9 +13,10 @@ import pytest
 
 from larp_model import state as packed
 from larp_model.bodies import ball
-from larp_model.networks import Config
+from larp_model.networks import Weights
+from larp_model.parts.part import Model
 from larp_model.scene import Scene
-from larp_model.simulator import Simulator, Weights
+from larp_model.simulator import Simulator
 from larp_model.truth.mujoco import Truth
 from mpc import CEM, Gradient
 from mpc.loop import Diverged, Phase, Window, execute
@@ -71,9 +72,9 @@ def test_arguments_that_do_not_fit_are_refused_by_name(ball_model: Simulator, na
 
 
 def test_the_state_decides_the_precision_also_where_jax_holds_64_bits(
-    scene: Scene, compact: Config, compact_weights: Weights, reference: Reference
+    scene: Scene, compact: Model, compact_weights: Weights, reference: Reference
 ) -> None:
-    model = Simulator(scene, compact, compact_weights)
+    model = Simulator(compact, compact_weights)
     with jax.enable_x64(True):
         for kind in (jnp.float32, jnp.float64):
             state = jnp.asarray(reference.states[None, 0], kind)

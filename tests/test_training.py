@@ -14,16 +14,17 @@ import jax
 import numpy as np
 import pytest
 
-from larp_model import training
+from larp_model import designs, training
 from larp_model.bodies import chain
-from larp_model.networks import Config
+from larp_model.networks import Weights
+from larp_model.parts.part import Model
 from larp_model.scene import Scene
-from larp_model.simulator import Weights
 from larp_model.training import Batch, Recipe, Windows, first_contacts, statistics_of, train
 from larp_model.truth.episodes import Episodes, record
 from larp_model.truth.mujoco import Truth
 
 SWING = Scene((chain(links=2),))
+MODEL = designs.compact(SWING, designs.TINY)
 SHORT = Recipe(updates=200, batch=16, curriculum=((2, 1.0),), learning_rate=3e-3)
 
 
@@ -87,9 +88,9 @@ def test_a_recipe_refuses_nonsense_by_field(field: str, value: object) -> None:
         Recipe(**{field: value})  # type: ignore[arg-type]
 
 
-def test_a_short_training_lowers_the_loss(scene: Scene, compact: Config, episodes: Episodes, tmp_path: Path) -> None:
+def test_a_short_training_lowers_the_loss(compact: Model, episodes: Episodes, tmp_path: Path) -> None:
     recipe = Recipe(updates=200, batch=32, curriculum=((2, 1.0),), learning_rate=3e-3)
-    weights, log = train(scene, compact, recipe, [(episodes, 1.0)], tmp_path, quiet=True)
+    weights, log = train(compact, recipe, [(episodes, 1.0)], tmp_path, quiet=True)
     losses = [row["loss"] for row in log["history"]]
     assert len(losses) == 2 and losses[-1] < 0.8 * losses[0]
     assert not log["stopped_early"] and log["history"][-1]["update"] == 200
@@ -97,10 +98,10 @@ def test_a_short_training_lowers_the_loss(scene: Scene, compact: Config, episode
 
 
 def test_a_training_cut_off_goes_on_as_if_it_had_not_been(
-    compact: Config, swings: Episodes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    swings: Episodes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sources = [(swings, 1.0)]
-    whole, log = train(SWING, compact, SHORT, sources, tmp_path / "whole", quiet=True)
+    whole, log = train(MODEL, SHORT, sources, tmp_path / "whole", quiet=True)
     assert [row["update"] for row in log["history"]] == [100, 200]
     # A clock on which a checkpoint is due at every hundredth update, and a cut in the second hundred.
     monkeypatch.setattr(training, "time", SimpleNamespace(perf_counter=count(0.0, 100.0).__next__))
@@ -113,26 +114,26 @@ def test_a_training_cut_off_goes_on_as_if_it_had_not_been(
 
     monkeypatch.setattr(Windows, "draw", cut_off)
     with pytest.raises(KeyboardInterrupt):
-        train(SWING, compact, SHORT, sources, tmp_path / "cut", quiet=True)
-    resumed, log = train(SWING, compact, SHORT, sources, tmp_path / "cut", quiet=True)
+        train(MODEL, SHORT, sources, tmp_path / "cut", quiet=True)
+    resumed, log = train(MODEL, SHORT, sources, tmp_path / "cut", quiet=True)
     assert [row["update"] for row in log["history"]] == [200], "the first hundred were not trained again"
     assert same(resumed, whole)
-    again, log = train(SWING, compact, SHORT, sources, tmp_path / "cut", quiet=True)
+    again, log = train(MODEL, SHORT, sources, tmp_path / "cut", quiet=True)
     assert not log["history"] and same(again, whole)
 
 
-def measured(config: Config, swings: Episodes) -> Weights:
+def measured(swings: Episodes) -> Weights:
     """Fresh weights with the statistics of sound episodes."""
-    return statistics_of(SWING, config, Windows(SWING, [(swings, 1.0)], SHORT), np.random.default_rng(1))
+    return statistics_of(MODEL, Windows(SWING, [(swings, 1.0)], SHORT), np.random.default_rng(1))
 
 
-def test_bad_batches_are_dropped_and_counted(compact: Config, swings: Episodes, tmp_path: Path) -> None:
+def test_bad_batches_are_dropped_and_counted(swings: Episodes, tmp_path: Path) -> None:
     states = swings.states.copy()
     states[3] = np.nan
-    start, recipe = measured(compact, swings), dataclasses.replace(SHORT, batch=8)
+    start, recipe = measured(swings), dataclasses.replace(SHORT, batch=8)
     before = jax.tree.map(np.array, start)
     sources = [(swings._replace(states=states), 1.0)]
-    weights, log = train(SWING, compact, recipe, sources, tmp_path, start, quiet=True)
+    weights, log = train(MODEL, recipe, sources, tmp_path, start, quiet=True)
     drawn = [Windows(SWING, sources, recipe).draw(np.random.default_rng((0, i)), 2)[0] for i in range(200)]
     bad = sum(int(np.isnan(states).any()) for states in drawn)
     assert log["dropped"] == bad and 20 < bad < 180
@@ -140,18 +141,16 @@ def test_bad_batches_are_dropped_and_counted(compact: Config, swings: Episodes, 
     assert not same(weights, before) and same(start, before), "training leaves the weights it starts from alone"
 
 
-def test_training_on_bad_data_alone_stops_with_the_last_good_weights(
-    compact: Config, swings: Episodes, tmp_path: Path
-) -> None:
+def test_training_on_bad_data_alone_stops_with_the_last_good_weights(swings: Episodes, tmp_path: Path) -> None:
     worthless = swings._replace(states=np.full_like(swings.states, np.nan))
-    start = jax.tree.map(np.array, measured(compact, swings))
-    weights, log = train(SWING, compact, SHORT, [(worthless, 1.0)], tmp_path, start, quiet=True)
+    start = jax.tree.map(np.array, measured(swings))
+    weights, log = train(MODEL, SHORT, [(worthless, 1.0)], tmp_path, start, quiet=True)
     assert log["stopped_early"] and log["dropped"] == 100 and same(weights, start)
 
 
-def test_training_in_the_world_frame_turns_its_data(paper: Config, swings: Episodes, tmp_path: Path) -> None:
+def test_training_in_the_world_frame_turns_its_data(swings: Episodes, tmp_path: Path) -> None:
     recipe = dataclasses.replace(SHORT, updates=100)
-    weights, log = train(SWING, paper, recipe, [(swings, 1.0)], tmp_path, quiet=True)
+    weights, log = train(designs.paper(SWING, designs.TINY), recipe, [(swings, 1.0)], tmp_path, quiet=True)
     assert log["dropped"] == 0 and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(weights))
     spread = np.asarray(weights.inputs["dynamics/chain2"].mean)[2:32]
     assert np.abs(spread).max() < 3.0

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from larp_model import features
+from larp_model import kinematics
 from larp_model import state as packed
 from larp_model.bodies import ball, capsule, chain, human, standing_height
 from larp_model.scene import Scene
@@ -118,7 +118,7 @@ def test_recorded_joints_do_not_come_apart(scene: Scene, reference: Reference) -
     falling = np.concatenate([truth.state(), *(truth.step(np.zeros((1, 0, 3))) for _ in range(30))])
     with jax.enable_x64(True):
         for described, states in ((scene, reference.states), (chains, falling)):
-            apart = features.displacement(described, jnp.asarray(states), features.morphology_of(described))
+            apart = kinematics.displacement(described, jnp.asarray(states), kinematics.morphology_of(described))
             assert np.linalg.norm(apart, axis=-1).max() < 1e-6
 
 

@@ -4,24 +4,27 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from larp_model.bodies import ball, human_and_ball
-from larp_model.networks import Config
-from larp_model.scene import Scene
-from larp_model.simulator import Weights, initial_weights, measure
-from larp_model.weights import VERSION, load, save, signature
+from larp_model import designs
+from larp_model.bodies import ball, capsule, human_and_ball, human_and_capsule
+from larp_model.networks import Weights
+from larp_model.parts.part import Model, initial_weights, measure
+from larp_model.scene import Body, Scene
+from larp_model.weights import VERSION, load, save
 
 
 @pytest.fixture
-def stored(tmp_path: Path, scene: Scene, compact: Config, compact_weights: Weights) -> Path:
+def stored(tmp_path: Path, compact: Model, compact_weights: Weights) -> Path:
     """The manifest of weights on disk."""
-    return save(tmp_path / "deep", "tiny", scene, compact, compact_weights, {"updates": 7, "seed": 0})
+    return save(tmp_path / "deep", "tiny", compact, compact_weights, {"updates": 7, "seed": 0})
 
 
 def equal(first: Weights, second: Weights) -> bool:
@@ -33,34 +36,54 @@ def equal(first: Weights, second: Weights) -> bool:
 def test_what_is_saved_is_what_is_loaded(
     kind: str, request: pytest.FixtureRequest, scene: Scene, tmp_path: Path
 ) -> None:
-    config, weights = request.getfixturevalue(kind), request.getfixturevalue(f"{kind}_weights")
-    manifest = save(tmp_path, "model", scene, config, weights, {})
-    found_config, found, _ = load(manifest, scene)
-    assert found_config == config and equal(found, weights)
+    model, weights = request.getfixturevalue(kind), request.getfixturevalue(f"{kind}_weights")
+    manifest = save(tmp_path, "model", model, weights, {})
+    found_model, found, _ = load(manifest, scene)
+    assert found_model == model and equal(found, weights)
 
 
-def test_weights_of_a_ball_alone_survive(compact: Config, tmp_path: Path) -> None:
+def test_weights_of_a_ball_alone_survive(tmp_path: Path) -> None:
     scene = Scene((ball(),))
+    model = designs.compact(scene, designs.TINY)
     state = jnp.zeros((2, 1, 13)).at[..., 3].set(1.0)
-    statistics = measure(scene, compact, state, state, jnp.zeros((2, 0, 3)), jnp.zeros((2, 1, 3)))
-    weights = initial_weights(scene, compact, jax.random.key(0), statistics)
-    assert equal(load(save(tmp_path, "ball", scene, compact, weights, {}), scene)[1], weights)
+    statistics = measure(model, state, state, jnp.zeros((2, 0, 3)), jnp.zeros((2, 1, 3)))
+    weights = initial_weights(model, jax.random.key(0), statistics)
+    assert equal(load(save(tmp_path, "ball", model, weights, {}), scene)[1], weights)
 
 
-def test_the_manifest_says_what_the_weights_are(stored: Path, scene: Scene, compact: Config) -> None:
+def test_a_scene_loads_the_parts_that_it_needs_and_no_other(
+    stored: Path, scene: Scene, compact_weights: Weights
+) -> None:
+    model, weights, _ = load(stored, scene.only("ball"))
+    assert [part.body.name for part in model.bodies] == ["ball"] and not model.pairs
+    assert weights.networks.keys() == {"dynamics/ball"} == weights.inputs.keys()
+    same = jax.tree.map(np.array_equal, weights.networks["dynamics/ball"], compact_weights.networks["dynamics/ball"])
+    assert all(jax.tree.leaves(same))
+
+
+def test_the_manifest_says_what_the_weights_are(stored: Path, scene: Scene, compact: Model) -> None:
     content = json.loads(stored.read_text())
-    assert content.keys() == {"version", "config", "scene", "sha256", "recipe"}
-    assert content["version"] == VERSION and content["scene"] == signature(scene)
-    assert Config(**content["config"]) == compact and content["recipe"] == {"updates": 7, "seed": 0}
+    assert content.keys() == {"version", "parts", "trained on", "sha256", "recipe"}
+    assert content["version"] == VERSION and content["recipe"] == {"updates": 7, "seed": 0}
+    assert [part["type"] for part in content["parts"]] == ["articulated", "sphere", "contact"]
+    assert content["parts"][2]["constants"] == {
+        "type": "meeting", "margin": 0.03, "advances": 3, "impedance": 0.99, "held": 0.002,
+    }  # fmt: skip
+    assert content["trained on"]["ball"]["lowest"] == content["trained on"]["ball"]["highest"]
     assert load(stored, scene)[2] == content
     assert {file.name for file in stored.parent.iterdir()} == {"tiny.json", "tiny.safetensors"}
 
 
-def test_saving_twice_writes_the_same_bytes(
-    stored: Path, scene: Scene, compact: Config, compact_weights: Weights
-) -> None:
+def test_constants_are_the_manifests_whatever_the_code_says_today(stored: Path, scene: Scene) -> None:
+    content = json.loads(stored.read_text())
+    content["parts"][2]["constants"]["margin"] = 0.05
+    stored.write_text(json.dumps(content))
+    assert load(stored, scene)[0].pairs[0].constants.margin == 0.05  # type: ignore[attr-defined]
+
+
+def test_saving_twice_writes_the_same_bytes(stored: Path, compact: Model, compact_weights: Weights) -> None:
     before = [file.read_bytes() for file in sorted(stored.parent.iterdir())]
-    save(stored.parent, "tiny", scene, compact, compact_weights, {"updates": 7, "seed": 0})
+    save(stored.parent, "tiny", compact, compact_weights, {"updates": 7, "seed": 0})
     assert [file.read_bytes() for file in sorted(stored.parent.iterdir())] == before
 
 
@@ -72,11 +95,50 @@ def refusal(stored: Path, scene: Scene) -> str:
     return str(caught.value)
 
 
+def other_human(**changes: Any) -> Scene:
+    """The kick's scene with another human."""
+    scene = human_and_ball()
+    return replace(scene, bodies=(replace(scene.bodies[0], **changes), scene.bodies[1]))
+
+
+def other_ball(radius: float) -> Scene:
+    """The kick's scene with another ball."""
+    scene = human_and_ball()
+    own = scene.bodies[1]
+    return replace(scene, bodies=(scene.bodies[0], replace(own, links=(replace(own.links[0], radius=radius),))))
+
+
+HUMAN: Body = human_and_ball().bodies[0]
+STRONG = replace(HUMAN.joints[0], motor=replace(HUMAN.joints[0].motor, stiffness=7.0))  # type: ignore[type-var]
+
+
 @pytest.mark.parametrize(
-    "other", [human_and_ball(height=1.8), human_and_ball(dt=0.005), human_and_ball().only("human")]
-)
-def test_weights_of_another_scene_are_refused(stored: Path, other: Scene) -> None:
-    assert "were made for scene" in refusal(stored, other)
+    ("other", "says"),
+    [
+        (human_and_ball(dt=0.005), "its dt is 0.005, but they were trained with 0.01"),
+        (replace(human_and_ball(), gravity=1.6), "its gravity is 1.6, but they were trained with 9.81"),
+        (human_and_ball(height=1.8), "human.pelvis.length is "),
+        (other_ball(radius=0.2), "ball.ball.radius is 0.2, but they were trained on 0.11"),
+        (other_human(joints=(STRONG, *HUMAN.joints[1:])), "motor.stiffness is 7.0, but they were trained with"),
+        (other_human(surface=replace(HUMAN.surface, friction=0.3)), "human.surface.friction is 0.3, but they"),
+        (replace(human_and_ball(), pairs=(replace(human_and_ball().pairs[0], first_links=("head",)),)),
+         "human-ball.first_links is ('head',), but they were trained with"),
+        (human_and_capsule(), "there is no part 'capsule' for this scene, but human, ball, human-ball"),
+        (Scene((capsule(),)), "there is no part 'capsule' for this scene"),
+    ],
+)  # fmt: skip
+def test_what_the_weights_were_not_made_for_is_refused_by_name(stored: Path, other: Scene, says: str) -> None:
+    assert says in refusal(stored, other)
+
+
+def test_links_of_any_size_that_was_trained_on_are_taken(
+    tmp_path: Path, scene: Scene, compact: Model, compact_weights: Weights
+) -> None:
+    sizes = np.stack([scene.morphology, 1.5 * scene.morphology])
+    manifest = save(tmp_path, "sizes", compact, compact_weights, {}, sizes)
+    larger = load(manifest, scene.sized(1.2 * scene.morphology))[0]
+    assert larger.bodies[0].body.links[0].length == pytest.approx(1.2 * scene.links[0].length)
+    assert "but they were trained on" in refusal(manifest, scene.sized(1.6 * scene.morphology))
 
 
 def flip(content: bytes, place: float) -> bytes:
@@ -106,30 +168,30 @@ def test_missing_files_are_refused(stored: Path, scene: Scene) -> None:
 def test_a_newer_version_is_refused_as_such(stored: Path, scene: Scene) -> None:
     content = json.loads(stored.read_text())
     content["version"] = VERSION + 1
-    content["config"]["attention"] = 4
+    content["parts"] = 4
     stored.write_text(json.dumps(content))
     assert f"are of version {VERSION + 1}, but {VERSION} is needed" in refusal(stored, scene)
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"config": 3}', "\udcff"])
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"parts": 3}', "\udcff"])
 def test_a_manifest_that_cannot_be_read_is_refused(stored: Path, scene: Scene, text: str) -> None:
     stored.write_text(text, errors="surrogateescape")
     assert "cannot be read" in refusal(stored, scene)
 
 
-@pytest.mark.parametrize(("field", "value"), [("width", 0), ("frame", "sideways"), ("depth", 3), ("width", "wide")])
-def test_a_configuration_that_makes_no_sense_is_refused(stored: Path, scene: Scene, field: str, value: object) -> None:
+@pytest.mark.parametrize(("field", "value"), [("width", 0), ("type", "turbulence"), ("depth", 3), ("width", "wide")])
+def test_a_part_that_makes_no_sense_is_refused(stored: Path, scene: Scene, field: str, value: object) -> None:
     content = json.loads(stored.read_text())
-    content["config"][field] = value
+    content["parts"][0]["size"][field] = value
     stored.write_text(json.dumps(content))
-    assert field in refusal(stored, scene)
+    assert str(value if field == "type" else field) in refusal(stored, scene)
 
 
 @pytest.mark.parametrize(("change", "says"), [({"width": 32}, "has shape"), ({"layers": 3}, "differ in the tensors")])
-def test_tensors_that_do_not_fit_their_config_are_refused(
+def test_tensors_that_do_not_fit_their_part_are_refused(
     change: dict[str, int], says: str, stored: Path, scene: Scene
 ) -> None:
     content = json.loads(stored.read_text())
-    content["config"] |= change
+    content["parts"][0]["size"] |= change
     stored.write_text(json.dumps(content))
     assert says in refusal(stored, scene)

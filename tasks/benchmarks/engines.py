@@ -151,8 +151,8 @@ class Traced(NamedTuple):
 
 def larp(scene: Scene, substeps: int) -> Traced:
     """The learned simulator with the shipped weights."""
-    config, weights, _ = stored.load(WEIGHTS, human_and_ball())
-    simulator = Simulator(scene, config, weights)
+    model, weights, _ = stored.load(WEIGHTS, scene)
+    simulator = Simulator(model, weights)
 
     def ball(state: Array) -> Array:
         return jnp.concatenate([state[:, -1, packed.POSITION], state[:, -1, packed.VELOCITY]], axis=-1)

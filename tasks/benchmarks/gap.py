@@ -135,8 +135,8 @@ def main(
     kick = prepare()
     models, truth = models_of(kick.scene, "larp", weights), models_of(kick.scene, "mujoco", weights)
     rows, episodes = candidates_of(kick, models, truth, targets, candidates, seed)
-    config, learned, _ = stored.load(weights, kick.scene)
-    simulator = Simulator(kick.scene, config, learned)
+    model, learned, _ = stored.load(weights, kick.scene)
+    simulator = Simulator(model, learned)
     launch = {str(before): evaluation.launch(simulator, episodes, before) for before in (0, 3)}
     ranks = {
         name: float(np.median([row["rank_correlation"] for row in rows[which::3]]))

@@ -76,12 +76,12 @@ def main(
     json = json or Path(f"runs/benchmarks/model_{scene}.json")
     report.ready(json, publish)
     remember_compilations()
-    config, learned, _ = stored.load(manifest, chosen.scene)
+    model, learned, _ = stored.load(manifest, chosen.scene)
     episodes = chosen.draw(sequences, seed)[0] if states is None else truth_episodes.load(states, chosen.scene)
-    found = evaluation.evaluate(Simulator(chosen.scene, config, learned), episodes, chosen.windows)
+    found = evaluation.evaluate(Simulator(model, learned), episodes, chosen.windows)
     source = f"--states {states.name}" if states else f"--sequences {sequences} --seed {seed}"
     command = f"python -m tasks.benchmarks.model --scene {scene} {source}"
-    report.write_json(json, {"command": command, "hardware": report.hardware(), "config": config.name, **found})
+    report.write_json(json, {"command": command, "hardware": report.hardware(), **found})
     title = f"{scene}: {len(episodes.states)} sequences"
     report.write_picture(json.with_suffix(".png"), picture(found["windows"], chosen, title))
     table = table_of(found, chosen)

@@ -16,12 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from larp_model import contact, features
+from larp_model import contact, kinematics
 from larp_model import state as packed
 from larp_model.bodies import KICKING_LINKS, ball, capsule, chain, human
-from larp_model.networks import Config
+from larp_model.designs import TINY, compact
+from larp_model.parts.part import initial_weights, measure
 from larp_model.scene import Pair, Scene
-from larp_model.simulator import Simulator, initial_weights, measure
+from larp_model.simulator import Simulator
 from larp_model.truth.mujoco import Truth
 from larp_model.truth.mujoco import finite as truth_finite
 from mpc import CostTerm, evaluate
@@ -46,8 +47,6 @@ KINDS = (
     "human and ball",
     "two humans",
 )
-# The least network that has all parts: its weights are random, its geometry and physics are real.
-TINY = Config("tiny", 2, 16, 2, 16, 2, 16, "heading", "change", "impulse", skip=True, aided=True)
 
 
 class Bench(NamedTuple):
@@ -134,9 +133,9 @@ def sizes(bench: Bench, body: str, field: str) -> list[Row]:
     scenes = [scaled(scene, body, field, factor) for factor in FACTORS]
     starts = np.stack([standing(each, bench.kick.start()) for each in scenes])
     controls = np.broadcast_to(bench.controls, (len(FACTORS), *bench.controls.shape))
-    morphology = jnp.stack([features.morphology_of(each) for each in scenes])
+    morphology = jnp.stack([kinematics.morphology_of(each) for each in scenes])
     states = np.asarray(jax.jit(bench.model.rollout)(starts, controls, morphology=morphology))
-    apart = np.asarray(jax.jit(lambda s: features.displacement(scene, s, morphology[:, None]))(jnp.asarray(states)))
+    apart = np.asarray(jax.jit(lambda s: kinematics.displacement(scene, s, morphology[:, None]))(jnp.asarray(states)))
     errors, found = [], []
     for index, (factor, each) in enumerate(zip(FACTORS, scenes, strict=True)):
         true, flags = Truth(each, 1, threads=1).rollout(starts[index][None], controls[index][None])
@@ -437,8 +436,8 @@ def horizons(bench: Bench) -> list[Row]:
     controls = kick.reference.window(0, length)[1][None]
     states = np.asarray(jax.jit(bench.model.rollout)(kick.start()[None], controls))[0]
     true, _ = Truth(scene, 1, threads=1).rollout(kick.start()[None], controls)
-    morphology = features.morphology_of(scene)[None]
-    apart = np.linalg.norm(np.asarray(features.displacement(scene, jnp.asarray(states), morphology)), axis=-1)
+    morphology = kinematics.morphology_of(scene)[None]
+    apart = np.linalg.norm(np.asarray(kinematics.displacement(scene, jnp.asarray(states), morphology)), axis=-1)
     found = []
     for steps in (100, 1_000, 5_000, length):
         part = sound(states[:steps])
@@ -550,11 +549,12 @@ def wild(scene: Scene, count: int, random: np.random.Generator) -> np.ndarray:
 
 
 def untrained(scene: Scene, seed: int) -> Simulator:
-    """A simulator of the scene with random networks, its inputs measured on wild states."""
+    """A simulator of the scene with small random networks, its inputs measured on wild states."""
     states = wild(scene, 64, np.random.default_rng(seed)).astype(np.float32)
     control, torque = jnp.zeros((64, len(scene.motors), 3)), jnp.zeros((64, len(scene.links), 3))
-    measured = measure(scene, TINY, jnp.asarray(states), jnp.asarray(states[::-1].copy()), control, torque)
-    return Simulator(scene, TINY, initial_weights(scene, TINY, jax.random.key(seed), measured))
+    model = compact(scene, TINY)
+    measured = measure(model, jnp.asarray(states), jnp.asarray(states[::-1].copy()), control, torque)
+    return Simulator(model, initial_weights(model, jax.random.key(seed), measured))
 
 
 class Tally(NamedTuple):
@@ -594,7 +594,7 @@ def random_scenes(kind: str, model: Simulator, scenes: int, each: int, steps: in
         starts.append(state)
         targets.append(control)
         pushes.append(torque)
-        shapes.append(np.repeat(np.asarray(features.morphology_of(scene))[None], each, axis=0))
+        shapes.append(np.repeat(np.asarray(kinematics.morphology_of(scene))[None], each, axis=0))
     larp_lost = 0
     size = CostTerm("size", lambda states, controls, context: states[:, :, 2])
     try:

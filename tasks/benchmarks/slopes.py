@@ -102,7 +102,7 @@ def of_steps(bench: Bench, count: int, seed: int) -> list[Row]:
 def ball_slopes(bench: Bench) -> list[Row]:
     """What a small change of the ball's height does within a step: where the growth comes from."""
     ball, radius = bench.kick.scene.bodies[-1].name, bench.kick.scene.links[-1].radius
-    model = replace(bench.model, scene=bench.kick.scene.only(ball))
+    model = replace(bench.model, model=bench.model.model.on(bench.kick.scene.only(ball)))
     slope = jax.jit(jax.vmap(jax.jacfwd(lambda s: model.step(s[None], jnp.zeros((1, 0, 3)))[0, 0])))
     rows = []
     for name, height, speed in (

@@ -1,0 +1,77 @@
+"""Which parts a simulator is made of, and how large their networks are.
+
+compact   everything that a body does is learned; the kick's
+hybrid    bodies move as mechanics says, and a network corrects it; the chains'
+paper     the networks and sizes of the paper
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from larp_model.networks import Size
+from larp_model.parts.articulated import Articulated, Base, Response
+from larp_model.parts.bases import FromNothing, OverMechanics
+from larp_model.parts.contact import Contact
+from larp_model.parts.paper import PaperBody, PaperContact
+from larp_model.parts.part import BodyPart, Model, PairPart
+from larp_model.parts.sphere import Sphere
+from larp_model.scene import Body, Pair, Scene
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Of the networks of articulated bodies, of balls, and of contacts with the responses to them."""
+
+    body: Size
+    ball: Size
+    contact: Size
+
+
+COMPACT = Sizes(Size(6, 256), Size(2, 32), Size(4, 128))
+HYBRID = Sizes(Size(5, 128), Size(2, 32), Size(4, 128))
+TINY = Sizes(Size(2, 16), Size(2, 16), Size(2, 16))  # the least that have all parts
+PAPER = Sizes(Size(12, 512, skip=False), Size(12, 128, skip=False), Size(6, 128, skip=False))
+
+
+def compact(scene: Scene, sizes: Sizes = COMPACT) -> Model:
+    """The model that the kick is planned with."""
+    return _impulsive(scene, sizes, FromNothing())
+
+
+def hybrid(scene: Scene, sizes: Sizes = HYBRID) -> Model:
+    """The model over mechanics."""
+    return _impulsive(scene, sizes, OverMechanics())
+
+
+def paper(scene: Scene, sizes: Sizes = PAPER) -> Model:
+    """The paper's model."""
+
+    def body_part(body: Body) -> BodyPart:
+        return PaperBody(body, scene.dt, sizes.ball if body.is_ball else sizes.body)
+
+    return _made(scene, body_part, lambda bodies, pair: PaperContact(bodies, pair, scene.dt, sizes.contact))
+
+
+DESIGNS: dict[str, Callable[[Scene], Model]] = {"compact": compact, "hybrid": hybrid, "paper": paper}
+
+
+def _impulsive(scene: Scene, sizes: Sizes, base: Base) -> Model:
+    """Bodies on this base, and contacts that are impulses."""
+
+    def body_part(body: Body) -> BodyPart:
+        if body.is_ball:
+            return Sphere(body, scene.dt, scene.gravity, sizes.ball)
+        touched = any(body.name in (pair.first, pair.second) for pair in scene.pairs)
+        response = Response(sizes.contact) if touched else None
+        return Articulated(body, scene.dt, scene.gravity, base, sizes.body, response)
+
+    return _made(scene, body_part, lambda bodies, pair: Contact(bodies, pair, scene.dt, sizes.contact))
+
+
+def _made(
+    scene: Scene, body_part: Callable[[Body], BodyPart], pair_part: Callable[[tuple[Body, Body], Pair], PairPart]
+) -> Model:
+    pairs = (pair_part((scene.body(pair.first), scene.body(pair.second)), pair) for pair in scene.pairs)
+    return Model(scene, tuple(body_part(body) for body in scene.bodies), tuple(pairs))

@@ -1,0 +1,1 @@
+"""The learned parts of a simulator, one a file: see `part`."""

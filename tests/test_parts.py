@@ -1,0 +1,144 @@
+"""The contract of the parts: what holds of every design in every scene, with random weights, in double precision."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import Array
+
+from larp_model import designs, rotation
+from larp_model import state as packed
+from larp_model.kinematics import kinematics, morphology_of
+from larp_model.networks import Weights
+from larp_model.parts.contact import Contact
+from larp_model.parts.part import Hits, Model, initial_weights, measure
+from larp_model.simulator import step
+from larp_model.training import first_contacts
+from larp_model.truth.episodes import Episodes
+from tasks.scenarios import scenario
+
+SOON = {"xla_backend_optimization_level": 0}
+STEP = jax.jit(step, static_argnums=0, compiler_options=SOON)
+# The scenes that each design is for.
+CASES = [("compact", "human_ball"), ("hybrid", "human_ball"), ("paper", "human_ball"), ("hybrid", "chains2")]
+MAKE = {"compact": designs.compact, "hybrid": designs.hybrid, "paper": designs.paper}
+
+
+class Case(NamedTuple):
+    """A model with random weights, and six states (6, L, 13) in which its bodies meet, with controls (6, J, 3)."""
+
+    model: Model
+    weights: Weights
+    states: np.ndarray
+    controls: np.ndarray
+
+    def after(self, states: np.ndarray | Array) -> np.ndarray:
+        """The next states."""
+        return np.asarray(STEP(self.model, self.weights, states, self.controls))
+
+
+@pytest.fixture(autouse=True)
+def double_precision() -> Iterator[None]:
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="module")
+def chains() -> Episodes:
+    """Truth of two chains of two links."""
+    with jax.enable_x64(False):
+        return scenario("chains2").draw(32, 1)[0]
+
+
+@pytest.fixture(scope="module", params=CASES, ids="-".join)
+def case(request: pytest.FixtureRequest, episodes: Episodes, chains: Episodes) -> Case:
+    design, name = request.param
+    scene, given = scenario(name).scene, episodes if name == "human_ball" else chains
+    with jax.enable_x64(False):
+        contacts = first_contacts(scene, given, chunk=64)
+        rows = np.flatnonzero(contacts >= 0)[:6]
+        before, after = (given.states[rows, contacts[rows] + later] for later in (0, 1))
+        controls, torques = given.controls[rows, contacts[rows]], given.torques[rows, contacts[rows]]
+        model = MAKE[design](scene, designs.TINY)
+        found = jax.jit(partial(measure, model), compiler_options=SOON)(before, after, controls, torques)
+        weights = initial_weights(model, jax.random.key(0), found)
+    states = before.astype(float)
+    states[..., packed.ORIENTATION] /= np.linalg.norm(states[..., packed.ORIENTATION], axis=-1, keepdims=True)
+    return Case(model, weights, states, controls.astype(float))
+
+
+def moved_apart(case: Case) -> np.ndarray:
+    """The states with the last body carried far away."""
+    states = case.states.copy()
+    states[:, case.model.scene.rows(case.model.scene.bodies[-1].name), :2] += 40.0
+    return states
+
+
+def test_bodies_that_meet_change_each_other(case: Case) -> None:
+    last = case.model.scene.rows(case.model.scene.bodies[-1].name)
+    change = case.after(case.states)[..., packed.VELOCITY] - case.after(moved_apart(case))[..., packed.VELOCITY]
+    for rows in (slice(0, last.start), last):
+        assert np.abs(change[:, rows]).max() > 1e-4, "without contact there would be little to test"
+
+
+def test_neither_the_order_of_bodies_nor_one_that_can_touch_nothing_changes_the_others(case: Case) -> None:
+    scene = case.model.scene
+    last = scene.bodies[-1]
+    crowded = replace(scene, bodies=(replace(last, name="other"), *scene.bodies[::-1]))
+    order = [last, *scene.bodies[::-1]]  # the other one is in the very same place
+    rows = np.concatenate([np.arange(len(scene.links))[scene.rows(body.name)] for body in order])
+    motors = np.concatenate([np.arange(len(scene.motors))[scene.motor_rows(body.name)] for body in order])
+    model, others = case.model.on(crowded), rows[len(last.links) :]
+    found = np.asarray(STEP(model, case.weights, case.states[:, rows], case.controls[:, motors]))[:, len(last.links) :]
+    np.testing.assert_allclose(found, case.after(case.states)[:, others], atol=1e-9)
+
+
+def test_shifting_the_world_shifts_a_step(case: Case) -> None:
+    shift = np.zeros(packed.SIZE)
+    shift[:2] = 3.0, -7.0
+    np.testing.assert_allclose(case.after(case.states + shift), case.after(case.states) + shift, atol=1e-7)
+
+
+def test_turning_the_world_turns_a_step_of_what_says_so(case: Case) -> None:
+    angle = np.linspace(-3.0, 3.0, len(case.states))
+    turn = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+    found = case.after(rotation.turn_states(jnp.asarray(case.states), turn))
+    expected = np.asarray(rotation.turn_states(jnp.asarray(case.after(case.states)), turn))
+    same = np.abs(np.delete(found - expected, np.s_[packed.ORIENTATION], axis=-1)).max() < 1e-7
+    assert same == case.model.invariant, "what is not invariant has to be taught by turning its data"
+
+
+def test_forward_derivatives_of_a_step_are_those_of_differences(case: Case) -> None:
+    direction = np.random.default_rng(0).standard_normal(case.states.shape)
+
+    def moved(states: Array) -> Array:
+        return step(case.model, case.weights, states, jnp.asarray(case.controls))
+
+    slope = jax.jit(lambda s, d: jax.jvp(moved, (s,), (d,))[1], compiler_options=SOON)(case.states, direction)
+    ahead, behind = (case.after(case.states + side * direction) for side in (1e-7, -1e-7))
+    np.testing.assert_allclose((ahead - behind) / 2e-7, slope, atol=1e-4 * np.abs(slope).max())
+
+
+def test_what_two_bodies_do_to_each_other_adds_up_to_nothing(case: Case) -> None:
+    [pair], model = case.model.pairs, case.model
+    if not isinstance(pair, Contact):
+        pytest.skip("the paper's features have no meaning of their own")
+
+    def hits(states: Array, controls: Array) -> tuple[Hits, Hits]:
+        seen = model.each(kinematics(model.scene, states, morphology_of(model.scene)[None]))
+        free = []
+        for part, own in zip(model.bodies, seen, strict=True):
+            targets = controls[:, model.scene.motor_rows(part.body.name)]
+            free.append(part.move(case.weights, own, targets, jnp.zeros_like(own.halves)).free)
+        return pair.meet(case.weights, (seen[0], seen[1]), (free[0], free[1]))
+
+    first, second = jax.jit(hits, compiler_options=SOON)(case.states, case.controls)
+    assert np.abs(first.push).max() > 1e-3
+    np.testing.assert_allclose((first.push.sum(axis=1) + second.push.sum(axis=1))[:, :3], 0.0, atol=1e-12)

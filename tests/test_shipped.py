@@ -1,0 +1,45 @@
+"""The shipped weights against the truth, on seeds they were not trained on: weights that are finite garbage fail."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from larp_model import evaluation
+from larp_model import state as packed
+from larp_model import weights as stored
+from larp_model.simulator import Simulator
+from tasks.scenarios import scenario
+
+
+@pytest.mark.parametrize(
+    ("name", "bars"), [("chains1", (0.0015, 0.012)), ("chains2", (0.002, 0.018)), ("chain4", (0.002, 0.018))]
+)
+def test_the_shipped_chains_err_no_more_than_they_did(name: str, bars: tuple[float, float]) -> None:
+    chosen = scenario(name)
+    model, learned, _ = stored.load(stored.SHIPPED / f"{name}.json", chosen.scene)
+    given, _ = chosen.draw(32, 3)
+    simulator = Simulator(model, learned)
+    found = evaluation.predict(
+        simulator, given.states[:, 0], given.controls[:, :40], given.torques[:, :40], given.morphology
+    )
+    usual = np.broadcast_to(chosen.scene.morphology, given.morphology.shape)
+    blind = evaluation.predict(simulator, given.states[:, 0], given.controls[:, :40], given.torques[:, :40], usual)
+    error, unseen = (
+        np.linalg.norm((each - given.states[:, 1:41])[..., packed.POSITION], axis=-1) for each in (found, blind)
+    )
+    assert error.mean() < 0.8 * unseen.mean(), "the sizes of the links are minded"
+    assert error[:, :10].mean() < bars[0] and error.mean() < bars[1]
+
+
+def test_the_shipped_human_and_ball_err_no_more_than_they_did() -> None:
+    chosen = scenario("human_ball")
+    model, learned, _ = stored.load(stored.SHIPPED / "human_ball.json", chosen.scene)
+    given, _ = chosen.draw(64, 3)
+    found = evaluation.evaluate(Simulator(model, learned), given, (10, 38))
+    for steps, bars in (("10", {"human": 0.006, "ball": 0.003}), ("38", {"human": 0.024, "ball": 0.04})):
+        for body, bar in bars.items():
+            assert found["windows"][steps][body] < bar, f"{body} after {steps} steps"
+    launch = found["launch"]["3"]
+    assert found["diverged"] == 0 and launch["count"] > 10
+    assert launch["relative_error"]["median"] < 0.16 and launch["angle_deg"]["median"] < 5.0
