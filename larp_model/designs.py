@@ -15,7 +15,7 @@ from larp_model.parts.articulated import Articulated, Base, Response
 from larp_model.parts.bases import FromNothing, OverMechanics
 from larp_model.parts.contact import Contact
 from larp_model.parts.paper import PaperBody, PaperContact
-from larp_model.parts.part import BodyPart, Model, PairPart
+from larp_model.parts.part import BodyPart, Model, PairPart, ordered
 from larp_model.parts.sphere import Sphere
 from larp_model.scene import Body, Pair, Scene
 
@@ -73,5 +73,5 @@ def _impulsive(scene: Scene, sizes: Sizes, base: Base) -> Model:
 def _made(
     scene: Scene, body_part: Callable[[Body], BodyPart], pair_part: Callable[[tuple[Body, Body], Pair], PairPart]
 ) -> Model:
-    pairs = (pair_part((scene.body(pair.first), scene.body(pair.second)), pair) for pair in scene.pairs)
+    pairs = (pair_part(bodies, pair) for pair, bodies in ordered(scene))
     return Model(scene, tuple(body_part(body) for body in scene.bodies), tuple(pairs))

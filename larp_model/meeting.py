@@ -85,9 +85,9 @@ class Meeting(NamedTuple):
     gap: (B, P) [m] when the step begins. lowest: the smallest seen [m]. near: 1 where the links touch within the step,
     falling to 0 over the margin. remaining: (B, P) [s] of the step. normal: from the first to the second. relative:
     velocity [m/s] of the first against the second, at the contact; approach (B, P) [m/s] along the normal, slide across
-    it. impact: along the normal. arms: from either link's centre to the contact [m]. centre: of the second link [m].
-    given: velocity (B, P, 3) [m/s] between them per impulse along the normal. mass: (B, P) effective mass [kg] along
-    the normal, the links' parents included.
+    it. impact: along the normal. gained: of the relative velocity, in the step if nothing touches. arms: from either
+    link's centre to the contact [m]. centres: of both links [m]. given: velocity (B, P, 3) [m/s] between them per
+    impulse along the normal. mass: (B, P) effective mass [kg] along the normal, the links' parents included.
     """
 
     gap: Array
@@ -99,10 +99,18 @@ class Meeting(NamedTuple):
     approach: Array
     slide: Array
     impact: Impact
+    gained: Array
     arms: tuple[Array, Array]
-    centre: Array
+    centres: tuple[Array, Array]
     given: Array
     mass: Array
+
+    def flipped(self) -> Meeting:
+        """The same as the second body sees it."""
+        return self._replace(
+            normal=-self.normal, relative=-self.relative, slide=-self.slide, gained=-self.gained, given=-self.given,
+            arms=self.arms[::-1], centres=self.centres[::-1],
+        )  # fmt: skip
 
 
 def rows_of(pair: Pair, first: Body, second: Body) -> tuple[np.ndarray, np.ndarray]:
@@ -128,7 +136,7 @@ def meet(pair: Pair, first: Party, second: Party, dt: float, constants: Constant
     a, b = first.segment, second.segment
     (v1, w1), (dv1, dw1), (v2, w2), (dv2, dw2) = first.before, first.gained, second.before, second.gained
 
-    def closest_at(time: Array) -> tuple[Closest, Array, Array, Array, Array]:
+    def closest_at(time: Array) -> tuple[Closest, Array, Array, Array, Array, tuple[Array, Array]]:
         share = (time / dt)[..., None]
         half = 0.5 * share
         one = contact.moved(a, v1 + half * dv1, w1 + half * dw1, time)
@@ -137,10 +145,11 @@ def meet(pair: Pair, first: Party, second: Party, dt: float, constants: Constant
         arm1, arm2 = found.point - one.centre, found.point - two.centre
         relative = v1 + share * dv1 + jnp.cross(w1 + share * dw1, arm1)
         relative -= v2 + share * dv2 + jnp.cross(w2 + share * dw2, arm2)
-        return found, arm1, arm2, relative, jnp.sum(relative * found.normal, axis=-1)
+        approach = jnp.sum(relative * found.normal, axis=-1)
+        return found, arm1, arm2, relative, approach, (one.centre, two.centre)
 
     def advance(time: Array, nothing: None) -> tuple[Array, Array]:
-        found, _, _, _, approach = closest_at(time)
+        found, _, _, _, approach, _ = closest_at(time)
         ahead = contact.time_of_impact(found.distance, approach, dt - time)
         # Links that sped up met earlier than their first speeds told.
         back = jnp.minimum(found.distance, 0.0) / jnp.where(approach > 1e-3, approach, jnp.inf)
@@ -148,7 +157,7 @@ def meet(pair: Pair, first: Party, second: Party, dt: float, constants: Constant
 
     # A scan, because an unrolled loop would be compiled as many times over.
     time, gaps = jax.lax.scan(advance, jnp.zeros(a.radius.shape, v1.dtype), length=constants.advances)
-    found, arm1, arm2, relative, approach = closest_at(time)
+    found, arm1, arm2, relative, approach, centres = closest_at(time)
     gained = dv1 + jnp.cross(dw1, arm1) - dv2 - jnp.cross(dw2, arm2)
     acceleration = jnp.sum(gained * found.normal, axis=-1) / dt
     depth = jnp.maximum(-found.distance, 0.0)
@@ -169,8 +178,9 @@ def meet(pair: Pair, first: Party, second: Party, dt: float, constants: Constant
         approach=approach,
         slide=relative - approach[..., None] * found.normal,
         impact=impact,
+        gained=gained,
         arms=(arm1, arm2),
-        centre=b.centre,
+        centres=centres,
         given=along_normal,
         mass=1.0 / jnp.sum(along_normal * found.normal, axis=-1),
     )

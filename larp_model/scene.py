@@ -183,6 +183,10 @@ class Pair:
     second_links: tuple[str, ...]
     surface: Surface
 
+    def flipped(self) -> Pair:
+        """The same pair, its bodies named the other way round."""
+        return Pair(self.second, self.first, self.second_links, self.first_links, self.surface)
+
 
 @dataclass(frozen=True)
 class Scene:

@@ -23,7 +23,17 @@ from larp_model.parts.articulated import Articulated, Response
 from larp_model.parts.bases import FromNothing, OverMechanics
 from larp_model.parts.contact import Contact
 from larp_model.parts.paper import PaperBody, PaperContact
-from larp_model.parts.part import BodyPart, Model, PairPart, assemble, bodies_of, initial_weights, measure
+from larp_model.parts.part import (
+    BodyPart,
+    Model,
+    PairPart,
+    assemble,
+    bodies_of,
+    initial_weights,
+    measure,
+    name_of,
+    ordered,
+)
 from larp_model.parts.sphere import Sphere
 from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface
 
@@ -193,9 +203,8 @@ def differences(part: BodyPart | PairPart, scene: Scene, trained: Mapping[str, T
         was, now = getattr(part, name, None), getattr(scene, name)
         if was is not None and was != now:
             yield f"its {name} is {now}, but they were trained with {was}"
-    for pair in scene.pairs:
-        kinds = [scene.body(name).kind for name in (pair.first, pair.second)]
-        if hasattr(part, "pair") and kinds == [body.kind for body in bodies_of(part)]:
+    for pair, bodies in ordered(scene):
+        if hasattr(part, "pair") and name_of(*bodies) == name_of(*bodies_of(part)):
             for name in ("first_links", "second_links", "surface"):
                 yield from _differ(f"{pair.first}-{pair.second}.{name}", getattr(pair, name), getattr(part.pair, name))
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-from larp_model import meeting
+from larp_model import contact, meeting
 from larp_model.kinematics import Kinematics
 from larp_model.meeting import Meeting, Party, Velocities
 from larp_model.networks import Measured, Perceptron, Size, Statistics, Weights, bounded, evaluate
@@ -16,20 +18,48 @@ from larp_model.parts.part import Hits, name_of
 from larp_model.parts.sphere import RARELY
 from larp_model.scene import Body, Pair
 
+UP = np.array([0.0, 0.0, 1.0], np.float32)
+
+
+class Push(NamedTuple):
+    """Between two links: impulse (B, P, 3) [N s] on the other and its lag (B, P, 1) [s].
+
+    lifts: impulses (B, P, 3) [N s] with which the ground holds both.
+    """
+
+    impulse: Array
+    lag: Array
+    lifts: tuple[Array, Array]
+
+    def flipped(self) -> Push:
+        """The same from the other's side."""
+        return Push(-self.impulse, self.lag, self.lifts[::-1])
+
+    def mean(self, other: Push) -> Push:
+        """Half of both."""
+        return jax.tree.map(lambda a, b: 0.5 * (a + b), self, other)
+
 
 @dataclass(frozen=True)
 class Contact:
-    """An impulse along the contact's own directions, none where links are further apart than a margin.
+    """An impulse between two links, and how the ground holds against it; none where they are apart.
+
+    It is made of the contact's own vectors, and what the network sees of them are their products: turned or mirrored,
+    everything is as before. The same from either side: bodies are in the order of their kinds, and where they are of
+    one kind both views are taken, and their mean.
 
     bounds: what the network may add, so that no state, however odd, is thrown out of the world: share of the free
-    impact, normal speed [m/s], slide, binormal, upward speed [m/s], lag [ms].
+    impact, normal speed [m/s], shares along the slide and along the four vectors of `view`, speeds up from the ground
+    [m/s], lag [ms]. grounded: height of a link above the ground at which it is not felt [m]. arm: unit of arms [m].
     """
 
     bodies: tuple[Body, Body]
     pair: Pair
     dt: float
     size: Size
-    bounds: tuple[float, ...] = (1.0, 3.0, 1.0, 1.0, 3.0, 5.0)
+    bounds: tuple[float, ...] = (1.0, 3.0, 1.0, 1.0, 1.0, 1.0, 1.0, 3.0, 3.0, 5.0)
+    grounded: float = 0.03
+    arm: float = 0.1
     constants: meeting.Constants = field(default_factory=meeting.Constants)
 
     @property
@@ -45,72 +75,102 @@ class Contact:
         self, weights: Weights, seen: tuple[Kinematics, Kinematics], free: tuple[Velocities, Velocities]
     ) -> tuple[Hits, Hits]:
         """See `PairPart`."""
+        first, second = meeting.parties(self.pair, self.bodies, seen, free)
 
         def touch() -> tuple[Hits, Hits]:
-            first, second = meeting.parties(self.pair, self.bodies, seen, free)
-            found = self.met(first, second)
-            outputs = evaluate(self.networks()[self.name], weights, self.name, self.inputs(first, second, found))
-            impulse, lag = self.impulse(found, bounded(outputs, self.bounds) * found.near[..., None])
-            pushes = [jnp.concatenate([side * impulse, jnp.cross(arm, side * impulse)], axis=-1)
-                      for side, arm in zip((-1.0, 1.0), found.arms, strict=True)]  # fmt: skip
-            pooled = []
-            for party, side, push in zip((first, second), (-1.0, 1.0), pushes, strict=True):
-                own = jax.nn.one_hot(party.rows, len(party.body.links), dtype=impulse.dtype)
-                travel = side * impulse * lag
-                pooled.append(Hits(*(jnp.einsum("bpf,pl->blf", each, own) for each in (push, travel))))
-            return pooled[0], pooled[1]
+            met = meeting.meet(self.pair, first, second, self.dt, self.constants)
+            push = self.view(weights, first, second, met)
+            if self.symmetric:
+                push = push.mean(self.view(weights, second, first, met.flipped()).flipped())
+            one = _onto(first, -push.impulse, push.lag, met.arms[0], push.lifts[0])
+            return one, _onto(second, push.impulse, push.lag, met.arms[1], push.lifts[1])
 
         # Steps without contact are by far the most.
-        near = meeting.within_reach(*meeting.parties(self.pair, self.bodies, seen, free), self.dt, self.constants)
+        near = meeting.within_reach(first, second, self.dt, self.constants)
         one, two = jax.lax.cond(near, touch, lambda: (Hits.none(seen[0]), Hits.none(seen[1])))
         return one, two
 
     def measure(self, seen: tuple[Kinematics, Kinematics], free: tuple[Velocities, Velocities]) -> Measured:
         """See `PairPart`."""
-        parties = meeting.parties(self.pair, self.bodies, seen, free)
-        found = self.met(*parties)
-        inputs = self.inputs(*parties, found)
-        near = found.near.reshape(-1) + RARELY
-        return {self.name: (Statistics.of(inputs.reshape(-1, inputs.shape[-1]), near), None)}
+        first, second = meeting.parties(self.pair, self.bodies, seen, free)
+        met = meeting.meet(self.pair, first, second, self.dt, self.constants)
+        views = [self.inputs(first, second, met)]
+        if self.symmetric:
+            views.append(self.inputs(second, first, met.flipped()))
+        inputs, near = jnp.concatenate(views), jnp.concatenate([met.near] * len(views))
+        return {self.name: (Statistics.of(inputs.reshape(-1, inputs.shape[-1]), near.reshape(-1) + RARELY), None)}
 
-    def met(self, first: Party, second: Party) -> Meeting:
-        """How the links meet."""
-        return meeting.meet(self.pair, first, second, self.dt, self.constants)
+    @property
+    def symmetric(self) -> bool:
+        """Whether both bodies are of one kind."""
+        return self.bodies[0].kind == self.bodies[1].kind
 
-    def inputs(self, first: Party, second: Party, met: Meeting) -> Array:
-        """What the network sees (B, P, F), in the first link's frame."""
-        (v1, w1), (dv1, dw1), (v2, w2) = first.before, first.gained, second.before
-        up = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0], v1.dtype), v1.shape)
-        vectors = [met.normal, met.arms[0], met.relative, v1, w1, w2, up, dv1, dw1, met.mass[..., None] * met.given]
-        turn = first.seen.matrices[:, first.rows]
-        local = jnp.sum(turn[..., None, :, :] * jnp.stack(vectors, axis=-2)[..., :, None], axis=-2)
-        scalars = jnp.stack(
-            [
-                jnp.clip(met.gap, -0.1, 0.2),
-                jnp.clip(met.lowest, -0.05, 0.05),
-                met.remaining,
-                met.approach,
-                met.impact.change,
-                met.impact.lag,
-                met.impact.gap,
-                met.centre[..., 2] - second.segment.radius,
-                v2[..., 2],
-                met.mass,
-            ],
-            axis=-1,
+    def inputs(self, me: Party, other: Party, met: Meeting) -> Array:
+        """What the network sees (B, P, F): products of the contact's vectors, scalars, and which links meet."""
+        swings = (jnp.cross(party.before.spin, arm) for party, arm in zip((me, other), met.arms, strict=True))
+        up = jnp.broadcast_to(jnp.asarray(UP, met.normal.dtype), met.normal.shape)
+        vectors = jnp.stack(
+            [met.normal, met.slide, up, met.mass[..., None] * met.given, met.gained, *met.arms, *swings], axis=-2
         )
-        size = met.gap.shape
-        which = jnp.broadcast_to(jnp.eye(size[1], dtype=scalars.dtype), (*size, size[1]))
-        return jnp.concatenate([local.reshape(*size, -1), scalars, which], axis=-1)
+        products = jnp.sum(vectors[..., :, None, :] * vectors[..., None, :, :], axis=-1)
+        each = [products[..., row, row:] for row in range(vectors.shape[-2])]
+        scalars = [
+            jnp.clip(met.gap, -0.1, 0.2),
+            jnp.clip(met.lowest, -0.05, 0.05),
+            met.remaining,
+            met.approach,
+            *met.impact,
+            met.mass,
+        ]
+        for party, centre in zip((me, other), met.centres, strict=True):
+            sizes = jnp.broadcast_to(party.seen.morphology[:, party.rows], (*met.gap.shape, 3))
+            scalars += [
+                jnp.minimum(_clearance(party, centre), 0.3),
+                party.before.velocity[..., 2],
+                *jnp.moveaxis(sizes, -1, 0),
+            ]
+        which = []
+        for party in (me, other):
+            links, places = np.unique(party.rows, return_inverse=True)
+            named = np.eye(len(links), dtype=met.gap.dtype)[places]
+            which.append(jnp.broadcast_to(named, (*met.gap.shape, len(links))))
+        return jnp.concatenate([*each, jnp.stack(scalars, axis=-1), *which], axis=-1)
 
-    def impulse(self, met: Meeting, outputs: Array) -> tuple[Array, Array]:
-        """Impulse (B, P, 3) [N s] on the second link and its lag (B, P, 1) [s], from gated outputs (B, P, 6).
+    def view(self, weights: Weights, me: Party, other: Party, met: Meeting) -> Push:
+        """What one body does to the other, by its own lights.
 
-        Along the normal: the free impact's, which the network scales and adds to; across it: along the slide, the
-        binormal and, for the ground's reaction, up.
+        Along the normal: the free impact's, which the network scales and adds to. Across it: along the slide, and, in
+        shares of the free impact, along the directions in which the links give way, of up, and of both arms.
         """
-        scale, add, along, across, up, late = jnp.split(outputs, len(self.bounds), axis=-1)
-        normal = met.impact.change[..., None] * (1.0 + scale) + add
-        vertical = jnp.array([0.0, 0.0, 1.0], outputs.dtype)
-        velocity = normal * met.normal + along * met.slide + across * jnp.cross(met.normal, met.slide) + up * vertical
-        return met.mass[..., None] * velocity, met.impact.lag[..., None] + 0.001 * late
+        outputs = evaluate(self.networks()[self.name], weights, self.name, self.inputs(me, other, met))
+        outputs = bounded(outputs, self.bounds) * met.near[..., None]
+        scale, add, along, *shares, lift, other_lift, late = jnp.split(outputs, len(self.bounds), axis=-1)
+        change, mass = met.impact.change[..., None], met.mass[..., None]
+        up = jnp.asarray(UP, change.dtype)
+        velocity = (change * (1.0 + scale) + add) * met.normal + along * met.slide
+        directions = (mass * met.given, up, met.arms[0] / self.arm, met.arms[1] / self.arm)
+        for share, direction in zip(shares, directions, strict=True):
+            across = direction - jnp.sum(direction * met.normal, axis=-1, keepdims=True) * met.normal
+            velocity += share * change * across
+        lifts = (
+            mass * speed * contact.smooth_gate(_clearance(party, centre), self.grounded)[..., None] * up
+            for speed, party, centre in zip((lift, other_lift), (me, other), met.centres, strict=True)
+        )
+        one, two = lifts
+        return Push(mass * velocity, met.impact.lag[..., None] + 0.001 * late, (one, two))
+
+
+def _clearance(party: Party, centre: Array) -> Array:
+    """How far links at centres (B, P, 3) are above the ground (B, P) [m]."""
+    segment = party.segment
+    return centre[..., 2] - jnp.abs(segment.half[..., 2]) - segment.radius
+
+
+def _onto(party: Party, impulse: Array, lag: Array, arm: Array, lift: Array) -> Hits:
+    """What an impulse (B, P, 3) [N s] at an arm and a lift from the ground do to the links of a body."""
+    own = jax.nn.one_hot(party.rows, len(party.body.links), dtype=impulse.dtype)
+    segment = party.segment
+    # The ground holds against the lower end.
+    foot = -jnp.sign(segment.half[..., 2:]) * segment.half
+    push = jnp.concatenate([impulse + lift, jnp.cross(arm, impulse) + jnp.cross(foot, lift)], axis=-1)
+    return Hits(*(jnp.einsum("bpf,pl->blf", each, own) for each in (push, (impulse + lift) * lag)))

@@ -6,7 +6,7 @@ sizes of its networks. A model is a scene with a part for every body and every p
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
@@ -17,7 +17,7 @@ from jax import Array
 from larp_model.kinematics import Kinematics, kinematics, morphology_of
 from larp_model.meeting import Velocities
 from larp_model.networks import Measured, Perceptron, Weights
-from larp_model.scene import Body, Scene
+from larp_model.scene import Body, Pair, Scene
 
 
 class Moving(NamedTuple):
@@ -176,6 +176,13 @@ def bodies_of(part: BodyPart | PairPart) -> tuple[Body, ...]:
     return part.bodies if hasattr(part, "bodies") else (part.body,)
 
 
+def ordered(scene: Scene) -> Iterator[tuple[Pair, tuple[Body, Body]]]:
+    """The scene's pairs with their bodies in the order of their kinds, whichever is named first."""
+    for pair in scene.pairs:
+        first, second = scene.body(pair.first), scene.body(pair.second)
+        yield (pair, (first, second)) if first.kind <= second.kind else (pair.flipped(), (second, first))
+
+
 def assemble(scene: Scene, parts: Sequence[BodyPart | PairPart]) -> Model:
     """The model of a scene from those parts that it needs, found by the kinds of their bodies."""
     known = {name_of(*bodies_of(part)): part for part in parts}
@@ -187,7 +194,6 @@ def assemble(scene: Scene, parts: Sequence[BodyPart | PairPart]) -> Model:
 
     own = tuple(replace(found(body), body=body) for body in scene.bodies)
     pairs = []
-    for pair in scene.pairs:
-        bodies = scene.body(pair.first), scene.body(pair.second)
+    for pair, bodies in ordered(scene):
         pairs.append(replace(found(*bodies), bodies=bodies, pair=pair))
     return Model(scene, own, tuple(pairs))
