@@ -205,8 +205,10 @@ def differences(part: BodyPart | PairPart, scene: Scene, trained: Mapping[str, T
             yield f"its {name} is {now}, but they were trained with {was}"
     for pair, bodies in ordered(scene):
         if hasattr(part, "pair") and name_of(*bodies) == name_of(*bodies_of(part)):
-            for name in ("first_links", "second_links", "surface"):
-                yield from _differ(f"{pair.first}-{pair.second}.{name}", getattr(pair, name), getattr(part.pair, name))
+            one, two = (body.name for body in bodies)
+            for owner, other, name in ((one, two, "first_links"), (two, one, "second_links")):
+                yield from _differ(f"what {other} can touch of {owner}", getattr(pair, name), getattr(part.pair, name))
+            yield from _differ(f"the surface of {one} and {two}", pair.surface, part.pair.surface)
 
 
 def _bodies_differ(body: Body, own: Body, trained: Trained) -> Iterator[str]:

@@ -122,8 +122,8 @@ STRONG = replace(HUMAN.joints[0], motor=replace(HUMAN.joints[0].motor, stiffness
         (other_human(joints=(STRONG, *HUMAN.joints[1:])), "motor.stiffness is 7.0, but they were trained with"),
         (other_human(surface=replace(HUMAN.surface, friction=0.3)), "human.surface.friction is 0.3, but they"),
         (replace(human_and_ball(), pairs=(replace(human_and_ball().pairs[0], first_links=("head",)),)),
-         "human-ball.first_links is ('head',), but they were trained with"),
-        (human_and_capsule(), "there is no part 'capsule' for this scene, but human, ball, human-ball"),
+         "what ball can touch of human is ('head',), but they were trained with"),
+        (human_and_capsule(), "there is no part 'capsule' for this scene, but human, ball, ball-human"),
         (Scene((capsule(),)), "there is no part 'capsule' for this scene"),
     ],
 )  # fmt: skip
