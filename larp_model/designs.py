@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 from larp_model.networks import Size
 from larp_model.parts.articulated import Articulated, Base, Response
@@ -54,7 +55,8 @@ def paper(scene: Scene, sizes: Sizes = PAPER) -> Model:
     return _made(scene, body_part, lambda bodies, pair: PaperContact(bodies, pair, scene.dt, sizes.contact))
 
 
-DESIGNS: dict[str, Callable[[Scene], Model]] = {"compact": compact, "hybrid": hybrid, "paper": paper}
+DesignName = Literal["compact", "hybrid", "paper"]
+DESIGNS: dict[DesignName, Callable[[Scene], Model]] = {"compact": compact, "hybrid": hybrid, "paper": paper}
 
 
 def _impulsive(scene: Scene, sizes: Sizes, base: Base) -> Model:

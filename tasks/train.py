@@ -22,6 +22,7 @@ from rich.console import Console
 
 from larp_model import designs, evaluation, training
 from larp_model import weights as stored
+from larp_model.designs import DesignName
 from larp_model.losses import LossWeights
 from larp_model.networks import Weights
 from larp_model.scene import Scene
@@ -70,6 +71,8 @@ OVER_MECHANICS = replace(
     STEPS, updates=10000, contact_share=0.4, before_contact=5, loss=LOSS._replace(far=0.005, fast=0.02)
 )
 GENERAL = (Stage("steps", "", OVER_MECHANICS),)
+# Algorithm 1 of the paper, with its losses.
+PAPER = (Stage("rollouts", "", training.Recipe(emphasis=())),)
 KICK = (
     Stage("steps", "", STEPS),
     Stage("rollouts", "", ROLLOUTS),
@@ -128,6 +131,7 @@ def stored_episodes(path: Path, scene: Scene, make: Callable[[], tuple[Episodes,
 
 def main(
     scene: str = WEIGHTS,
+    design: DesignName | None = None,
     folder: Path | None = None,
     out: Path | None = None,
     episodes: int = 10000,
@@ -139,7 +143,9 @@ def main(
 
     Args:
         scene: what is simulated; human_ball is the kick's.
-        folder: where the run keeps its stages and checkpoints; runs/train/SCENE by default.
+        design: which parts it is made of; compact for the kick and hybrid for all else by default.
+        folder: where the run keeps its stages and checkpoints; runs/train/SCENE by default, SCENE_DESIGN where
+            one is given.
         out: where the weights and their manifest go; a folder of the run's by default.
         episodes: random truth episodes.
         tasks: kicks planned for the candidates of each stage that adds some.
@@ -147,11 +153,12 @@ def main(
         seed: of the data and the training; the benchmarks use seeds below 100.
     """
     console, chosen = Console(), scenario(scene)
-    folder = folder or Path("runs/train") / chosen.name
+    folder = folder or Path("runs/train") / "_".join([chosen.name, *([design] if design else [])])
     remember_compilations()
-    kick = prepare() if chosen.name == WEIGHTS else None
-    stages = GENERAL if kick is None else KICK
-    model = (designs.compact if kick else designs.hybrid)(chosen.scene)
+    design = design or ("compact" if chosen.name == WEIGHTS else "hybrid")
+    kick = prepare() if (chosen.name, design) == (WEIGHTS, "compact") else None
+    stages = PAPER if design == "paper" else KICK if kick else GENERAL
+    model = designs.DESIGNS[design](chosen.scene)
     random = stored_episodes(folder / "random.npz", chosen.scene, lambda: chosen.draw(episodes, seed), console)
     sources = [random]
     if chosen.strikes:

@@ -12,6 +12,10 @@ import pytest
 from larp_model import kinematics
 from larp_model import state as packed
 from larp_model import weights as stored
+from larp_model.designs import DesignName
+from larp_model.parts.articulated import Articulated
+from larp_model.parts.paper import PaperBody
+from larp_model.parts.part import BodyPart
 from larp_model.training import first_contacts
 from larp_model.truth.episodes import Episodes
 from tasks import train
@@ -88,11 +92,15 @@ def test_weights_that_are_not_shipped_are_refused_with_the_way_to_them(tmp_path:
         model.main(scene="two_balls", json=tmp_path / "model.json")
 
 
-def test_a_scene_becomes_weights_and_scores(tmp_path: Path) -> None:
-    train.main(scene="chain4", folder=tmp_path / "run", episodes=64, effort=1e-4)
+@pytest.mark.parametrize(("design", "part", "stage"), [(None, Articulated, "steps"), ("paper", PaperBody, "rollouts")])
+def test_a_scene_becomes_weights_and_scores(
+    design: DesignName | None, part: type[BodyPart], stage: str, tmp_path: Path
+) -> None:
+    train.main(scene="chain4", design=design, folder=tmp_path / "run", episodes=64, effort=1e-4)
     manifest = tmp_path / "run/weights/chain4.json"
-    _, _, content = stored.load(manifest, SCENARIOS["chain4"].scene)
-    assert [each["stage"] for each in content["recipe"]["rounds"]] == ["steps"]
+    made, _, content = stored.load(manifest, SCENARIOS["chain4"].scene)
+    assert [type(each) for each in made.bodies] == [part]
+    assert [each["stage"] for each in content["recipe"]["rounds"]] == [stage]
     model.main(scene="chain4", sequences=16, weights=manifest, json=tmp_path / "model.json")
     found = json.loads((tmp_path / "model.json").read_text())
     assert found["windows"].keys() == {"10", "40", "80", "190"}
