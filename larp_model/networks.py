@@ -42,7 +42,7 @@ Measured = dict[str, tuple[Statistics, Statistics | None]]
 class Weights(NamedTuple):
     """Everything that is learned or measured: parameters and statistics by network.
 
-    networks: {"dynamics/human": flax parameters, "contact/human-ball": ...}. inputs: Statistics by the same names.
+    networks: {"dynamics/human": flax parameters, "contact/ball-human": ...}. inputs: Statistics by the same names.
     outputs: those of the networks whose outputs are changes of state.
     """
 
