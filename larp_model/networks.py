@@ -26,6 +26,10 @@ class Statistics(NamedTuple):
         spread = jnp.sqrt(jnp.sum(share * (samples - mean) ** 2, axis=0))
         return Statistics(mean, jnp.where(spread > 1e-5, spread, 1.0))
 
+    def beside(self, more: int) -> Statistics:
+        """The statistics with so many features more, which are left as they are."""
+        return Statistics(jnp.concatenate([self.mean, jnp.zeros(more)]), jnp.concatenate([self.spread, jnp.ones(more)]))
+
     def normalise(self, features: Array) -> Array:
         """Features (*, F) in standard deviations from the mean."""
         return (features - self.mean) / self.spread

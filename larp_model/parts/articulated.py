@@ -52,16 +52,9 @@ class Response:
     felt: float = 0.2
     scale: tuple[float, float] = (1.0, 0.1)
 
-    def inputs(self, inputs: Array, turn: Array, push: Array) -> Array:
-        """What the network sees (B, F + 6 n): the other's inputs, and pushes (B, n, 6) in its frame."""
-        vectors = jnp.concatenate([push[..., :3] / self.scale[0], push[..., 3:] / self.scale[1]], axis=1)
-        return side_by_side(inputs, rotation.about_z(vectors, rotation.opposite(turn)[:, None]))
-
-    def statistics(self, alone: Statistics, links: int) -> Statistics:
-        """Of `inputs`, from those of the other network's: pushes are left as they are scaled."""
-        return Statistics(
-            jnp.concatenate([alone.mean, jnp.zeros(6 * links)]), jnp.concatenate([alone.spread, jnp.ones(6 * links)])
-        )
+    def inputs(self, inputs: Array, turn: Array, hits: Hits) -> Array:
+        """What the network sees (B, F + 6 n): the other's inputs, and the pushes in its frame."""
+        return side_by_side(inputs, rotation.about_z(hits.scaled(self.scale), rotation.opposite(turn)[:, None]))
 
 
 @dataclass(frozen=True)
@@ -113,7 +106,7 @@ class Articulated:
         if response is not None:
 
             def answer() -> Array:
-                inputs = response.inputs(known.inputs, known.turn, hits.push)
+                inputs = response.inputs(known.inputs, known.turn, hits)
                 outputs = evaluate(self.networks()[self.response_name], weights, self.response_name, inputs)
                 felt = jnp.tanh(contact.norm(hits.push[..., :3]).sum(axis=-1, keepdims=True) / response.felt)
                 outputs = weights.outputs[self.name].spread * bounded(outputs, self.bound) * felt
@@ -130,7 +123,7 @@ class Articulated:
         alone = Statistics.of(known.inputs)
         found: Measured = {self.name: (alone, Statistics.of(outputs))}
         if self.response is not None:
-            found[self.response_name] = self.response.statistics(alone, len(self.body.links)), None
+            found[self.response_name] = alone.beside(6 * len(self.body.links)), None
         return found, Velocities.of(after)
 
 

@@ -54,8 +54,8 @@ class PaperBody:
     def respond(self, weights: Weights, seen: Kinematics, moving: Moving, hits: Hits) -> Array:
         """See `BodyPart`."""
         size, links = len(seen.state), len(self.body.links)
-        push = jnp.concatenate([hits.push[..., :3] / self.scale[0], hits.push[..., 3:] / self.scale[1]], axis=1)
-        outputs = evaluate(self.networks()[self.name], weights, self.name, side_by_side(moving.kept, push))
+        inputs = side_by_side(moving.kept, hits.scaled(self.scale))
+        outputs = evaluate(self.networks()[self.name], weights, self.name, inputs)
         outputs = weights.outputs[self.name].restore(bounded(outputs, self.bound))
         velocity, spin = jnp.moveaxis(outputs.reshape(size, 2, links, 3), 1, 0)
         place = packed.position(seen.state) + self.dt * velocity
@@ -63,10 +63,7 @@ class PaperBody:
 
     def measure(self, seen: Kinematics, after: Array, control: Array, torque: Array) -> tuple[Measured, Velocities]:
         """See `BodyPart`."""
-        alone, pooled = Statistics.of(self.inputs(seen, control, torque)), 6 * len(self.body.links)
-        inputs = Statistics(
-            jnp.concatenate([alone.mean, jnp.zeros(pooled)]), jnp.concatenate([alone.spread, jnp.ones(pooled)])
-        )
+        inputs = Statistics.of(self.inputs(seen, control, torque)).beside(6 * len(self.body.links))
         outputs = side_by_side(*Velocities.of(after))
         return {self.name: (inputs, Statistics.of(outputs))}, Velocities.of(seen.state)
 

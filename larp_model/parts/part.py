@@ -45,6 +45,10 @@ class Hits(NamedTuple):
         """Both together."""
         return Hits(self.push + more.push, self.travel + more.travel)
 
+    def scaled(self, scale: tuple[float, float]) -> Array:
+        """The two halves of the push (B, 2 n, 3) in these units, as a network sees them."""
+        return jnp.concatenate([self.push[..., :3] / scale[0], self.push[..., 3:] / scale[1]], axis=1)
+
     @staticmethod
     def none(seen: Kinematics) -> Hits:
         """Where nothing touches."""
