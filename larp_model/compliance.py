@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model.kinematics import anchors
+from larp_model.kinematics import anchors, picked
 from larp_model.scene import Body, Joint, Vector
 
 # For how long a motor's damping acts during an impact, as far as its armature-like effect goes [s].
@@ -33,53 +33,60 @@ def moments(length: Array, radius: Array, mass: Array) -> tuple[Array, Array]:
     return along, across
 
 
-def _stiffening(joint: Joint, held: float) -> float:
+def stiffening(joint: Joint, held: float) -> float:
+    """Moment that a joint takes up during an impact per spin that its links part with [kg m^2]."""
     motor = joint.motor
     return held * joint.damping if motor is None else motor.armature + held * motor.damping
 
 
 def compliance(
-    body: Body, rows: np.ndarray, matrices: Array, points: Array, morphology: Array, held: float = HELD
-) -> Array:
+    body: Body, rows: np.ndarray, matrices: Array, points: Array, morphology: Array, held: float = HELD,
+    chosen: Array | None = None,
+) -> Array:  # fmt: skip
     """Velocity gained per impulse, (B, P, 3, 3) [1/kg], by a point of each of P links of a body, in world axes.
 
     rows: (P,) the links. matrices: (B, n, 3, 3) rotations of the body's links. points: (B, P, 3) [m] from the links'
-    centres. morphology (B or 1, n, 3). held: see `HELD`.
+    centres. morphology (B or 1, n, 3). held: see `HELD`. chosen: (B, K, P) one-hot rows of the K links that points (B,
+    K, 3) are of; see `kinematics.picked`.
     """
-    stiff: dict[int, Array] = {}  # (G_jj + W_p)^-1 by link
+    known: dict[int, tuple[Array, Array, Array, Array]] = {}
     identity = jnp.eye(3, dtype=matrices.dtype)
-
-    def inertia(row: int) -> tuple[Array, Array]:
-        """1/m (B, 1, 1) and I^-1 (B, 3, 3)."""
-        length, radius, mass = morphology[..., row, 0], morphology[..., row, 1], morphology[..., row, 2]
-        along, across = moments(length, radius, mass)
-        stiffer = _stiffening(body.joints[row - 1], held) if row else 0.0
-        along, across = (along + stiffer)[..., None, None], (across + stiffer)[..., None, None]
-        axis = matrices[..., row, :, :] @ jnp.asarray(body.links[row].axis, matrices.dtype)
-        outer = axis[..., :, None] * axis[..., None, :]
-        return 1.0 / mass[..., None, None], (identity - outer) / across + outer / along
 
     def place(row: int, point: Vector) -> Array:
         local = anchors([point], [body.links[row].axis], morphology[..., row : row + 1, :])
         return jnp.sum(matrices[..., row, :, :] * local, axis=-1)
 
-    def yields(row: int, point: Array) -> Array:
-        """W at a point (B, 3) of a link."""
-        lightness, inverse = inertia(row)
-        cross_point = skew(point)
-        free = lightness * identity - cross_point @ inverse @ cross_point
-        if not row:
-            return free
-        joint = body.joints[row - 1]
-        arm = place(row, joint.child_anchor)
-        cross_arm = skew(arm)
-        if row not in stiff:
-            at_arm = lightness * identity - cross_arm @ inverse @ cross_arm
-            stiff[row] = invert(at_arm + yields(joint.parent, place(joint.parent, joint.parent_anchor)))
-        across = lightness * identity - cross_point @ inverse @ cross_arm
-        return free - across @ stiff[row] @ jnp.swapaxes(across, -1, -2)
+    def of(row: int) -> tuple[Array, Array, Array, Array]:
+        """Of a link 1/m, I^-1, and of its joint [j] and (G_jj + W_p)^-1, (B, 3, 3) each; of the root zeros for both."""
+        if row not in known:
+            length, radius, mass = (morphology[..., row, column] for column in range(3))
+            along, across = moments(length, radius, mass)
+            stiffer = stiffening(body.joints[row - 1], held) if row else 0.0
+            along, across = (along + stiffer)[..., None, None], (across + stiffer)[..., None, None]
+            axis = matrices[..., row, :, :] @ jnp.asarray(body.links[row].axis, matrices.dtype)
+            outer = axis[..., :, None] * axis[..., None, :]
+            lightness, inverse = identity / mass[..., None, None], (identity - outer) / across + outer / along
+            arm = stiff = jnp.zeros_like(outer)
+            if row:
+                joint = body.joints[row - 1]
+                arm = skew(place(row, joint.child_anchor))
+                onto = yielding(of(joint.parent), skew(place(joint.parent, joint.parent_anchor)))
+                stiff = invert(lightness - arm @ inverse @ arm + onto)
+            known[row] = lightness, inverse, arm, stiff
+        return known[row]
 
-    return jnp.stack([yields(int(row), points[..., index, :]) for index, row in enumerate(rows)], axis=-3)
+    links, places = np.unique(rows, return_inverse=True)
+    alone = [of(int(row)) for row in links]
+    stacked = (jnp.stack(jnp.broadcast_arrays(*each), axis=-3)[:, places] for each in zip(*alone, strict=True))
+    lightness, inverse, arm, stiff = (picked(each, chosen) for each in stacked)
+    return yielding((lightness, inverse, arm, stiff), skew(points))
+
+
+def yielding(link: tuple[Array, Array, Array, Array], point: Array) -> Array:
+    """W (*, 3, 3) at the point x of a link, given as [x]; see `compliance` for what is known of the link."""
+    lightness, inverse, arm, stiff = link
+    across = lightness - point @ inverse @ arm
+    return lightness - point @ inverse @ point - across @ stiff @ jnp.swapaxes(across, -1, -2)
 
 
 def skew(vector: Array) -> Array:

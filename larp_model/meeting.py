@@ -17,7 +17,7 @@ from larp_model import contact
 from larp_model import state as packed
 from larp_model.compliance import HELD, compliance
 from larp_model.contact import Closest, Impact, Segment
-from larp_model.kinematics import Kinematics, kinematics
+from larp_model.kinematics import Kinematics, kinematics, picked
 from larp_model.scene import Body, Pair, Scene
 
 
@@ -50,28 +50,34 @@ class Velocities(NamedTuple):
 class Party(NamedTuple):
     """One body of a pair and those of its links that can touch, one for each pair of links (P,).
 
-    free: the velocities at the end of the step if nothing touches.
+    free: the velocities at the end of the step if nothing touches. chosen: one-hot rows (B, K, P) of those pairs that
+    are looked at; all by default.
     """
 
     body: Body
     rows: np.ndarray
     seen: Kinematics
     free: Velocities
+    chosen: Array | None = None
+
+    def of(self, values: Array) -> Array:
+        """What values (B or 1, n, ...) of the body's links say of these, (B, P or K, ...)."""
+        return picked(values[:, self.rows], self.chosen)
 
     @property
     def segment(self) -> Segment:
         """The links' axes when the step begins."""
-        return self.seen.segments(self.rows)
+        return self.seen.segments(self.rows, self.chosen)
 
     @property
     def before(self) -> Velocities:
         """The links' velocities when the step begins, (B, P, 3)."""
-        return Velocities(*(each[:, self.rows] for each in Velocities.of(self.seen.state)))
+        return Velocities(*(self.of(each) for each in Velocities.of(self.seen.state)))
 
     @property
     def after(self) -> Velocities:
         """The links' velocities when the step ends, if nothing touches, (B, P, 3)."""
-        return Velocities(*(each[:, self.rows] for each in self.free))
+        return Velocities(*(self.of(each) for each in self.free))
 
     @property
     def gained(self) -> Velocities:
@@ -164,7 +170,7 @@ def meet(pair: Pair, first: Party, second: Party, dt: float, constants: Constant
     impact = contact.impact(depth, approach, acceleration, pair.surface, dt - time, constants.impedance)
     lowest = jnp.minimum(gaps[0], found.distance)
     given = sum(
-        compliance(each.body, each.rows, each.seen.matrices, arm, each.seen.morphology, constants.held)
+        compliance(each.body, each.rows, each.seen.matrices, arm, each.seen.morphology, constants.held, each.chosen)
         for each, arm in ((first, arm1), (second, arm2))
     )
     along_normal = jnp.sum(given * found.normal[..., None, :], axis=-1)
@@ -187,19 +193,20 @@ def meet(pair: Pair, first: Party, second: Party, dt: float, constants: Constant
 
 
 def within_reach(first: Party, second: Party, dt: float, constants: Constants = Constants()) -> Array:
-    """() whether any links of the pair, in any of the states, may come nearer than the margin within the step.
+    """(B, P) which links of the pair may come nearer than the margin within the step.
 
-    False only where all `near` of their meetings are zero: no point of a link moves faster than this bound.
+    False only where `near` of their meeting is zero: along the line between them their ends come no faster than this.
     """
+    found = contact.closest(first.segment, second.segment)
     speeds = []
-    for one, two in ((first.before, second.before), (first.after, second.after)):
-        swing = sum(
-            0.5 * each.seen.morphology[:, each.rows, 0] * contact.norm(own.spin)
-            for each, own in ((first, one), (second, two))
+    for mine, others in ((first.before, second.before), (first.after, second.after)):
+        closing = jnp.sum((mine.velocity - others.velocity) * found.normal, axis=-1)
+        swings = (
+            0.5 * party.of(party.seen.morphology)[..., 0] * contact.norm(own.spin)
+            for party, own in ((first, mine), (second, others))
         )
-        speeds.append(contact.norm(two.velocity - one.velocity) + swing)
-    lowest = contact.closest(first.segment, second.segment).distance - dt * jnp.maximum(*speeds)
-    return jnp.any(~(lowest >= constants.margin))
+        speeds.append(closing + sum(swings))
+    return ~(found.distance - dt * jnp.maximum(jnp.maximum(*speeds), 0.0) >= constants.margin)
 
 
 def gatherings(

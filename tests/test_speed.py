@@ -30,7 +30,7 @@ def near(what: Course) -> np.ndarray:
     times = range(what.controls.shape[1])
     pairs = [(jnp.asarray(states[:, t]), jnp.asarray(states[:, t + 1])) for t in times]
     parties = [gatherings(scene, before, shape, after)[0][1:] for before, after in pairs]
-    return np.array([within_reach(*both, scene.dt) for both in parties])
+    return np.array([within_reach(*both, scene.dt).any() for both in parties])
 
 
 def test_a_struck_ball_is_near_a_link_in_every_timed_step() -> None:

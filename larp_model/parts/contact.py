@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from larp_model import contact, meeting
-from larp_model.kinematics import Kinematics
+from larp_model.kinematics import Kinematics, picked
 from larp_model.meeting import Meeting, Party, Velocities
 from larp_model.networks import Measured, Perceptron, Size, Statistics, Weights, bounded, evaluate
 from larp_model.parts.part import Hits, name_of
@@ -74,21 +74,42 @@ class Contact:
     def meet(
         self, weights: Weights, seen: tuple[Kinematics, Kinematics], free: tuple[Velocities, Velocities]
     ) -> tuple[Hits, Hits]:
-        """See `PairPart`."""
+        """See `PairPart`. Contact by contact, for of all links that could touch most scenes have one near, or none."""
         first, second = meeting.parties(self.pair, self.bodies, seen, free)
+        within = meeting.within_reach(first, second, self.dt, self.constants)
+        # The first of a scene that is near is its number 1, and so on.
+        number = jnp.where(within, jnp.cumsum(within, axis=1), 0)
+        none = Hits.none(seen[0]), Hits.none(seen[1])
 
-        def touch() -> tuple[Hits, Hits]:
-            met = meeting.meet(self.pair, first, second, self.dt, self.constants)
-            push = self.view(weights, first, second, met)
-            if self.symmetric:
-                push = push.mean(self.view(weights, second, first, met.flipped()).flipped())
-            one = _onto(first, -push.impulse, push.lag, met.arms[0], push.lifts[0])
-            return one, _onto(second, push.impulse, push.lag, met.arms[1], push.lifts[1])
+        def touch(found: tuple[Hits, Hits], turn: Array) -> tuple[tuple[Hits, Hits], None]:
+            mine = number == turn
+
+            def one_more() -> tuple[Hits, Hits]:
+                both = self.touch(weights, *(party._replace(chosen=mine[:, None]) for party in (first, second)))
+                there = jnp.any(mine, axis=1)[:, None, None]
+                one, two = (
+                    hits.plus(jax.tree.map(lambda each: jnp.where(there, each, 0.0), more))
+                    for hits, more in zip(found, both, strict=True)
+                )
+                return one, two
+
+            return jax.lax.cond(jnp.any(mine), one_more, lambda: found), None
+
+        def all_of_them() -> tuple[Hits, Hits]:
+            return jax.lax.scan(touch, none, 1 + jnp.arange(number.shape[1]))[0]
 
         # Steps without contact are by far the most.
-        near = meeting.within_reach(first, second, self.dt, self.constants)
-        one, two = jax.lax.cond(near, touch, lambda: (Hits.none(seen[0]), Hits.none(seen[1])))
+        one, two = jax.lax.cond(jnp.any(within), all_of_them, lambda: none)
         return one, two
+
+    def touch(self, weights: Weights, first: Party, second: Party) -> tuple[Hits, Hits]:
+        """What links that meet do to each other's bodies."""
+        met = meeting.meet(self.pair, first, second, self.dt, self.constants)
+        push = self.view(weights, first, second, met)
+        if self.symmetric:
+            push = push.mean(self.view(weights, second, first, met.flipped()).flipped())
+        one = _onto(first, -push.impulse, push.lag, met.arms[0], push.lifts[0])
+        return one, _onto(second, push.impulse, push.lag, met.arms[1], push.lifts[1])
 
     def measure(self, seen: tuple[Kinematics, Kinematics], free: tuple[Velocities, Velocities]) -> Measured:
         """See `PairPart`."""
@@ -123,7 +144,7 @@ class Contact:
             met.mass,
         ]
         for party, centre in zip((me, other), met.centres, strict=True):
-            sizes = jnp.broadcast_to(party.seen.morphology[:, party.rows], (*met.gap.shape, 3))
+            sizes = jnp.broadcast_to(party.of(party.seen.morphology), (*met.gap.shape, 3))
             scalars += [
                 jnp.minimum(_clearance(party, centre), 0.3),
                 party.before.velocity[..., 2],
@@ -132,7 +153,7 @@ class Contact:
         which = []
         for party in (me, other):
             links, places = np.unique(party.rows, return_inverse=True)
-            named = np.eye(len(links), dtype=met.gap.dtype)[places]
+            named = picked(jnp.eye(len(links), dtype=met.gap.dtype)[None, places], party.chosen)
             which.append(jnp.broadcast_to(named, (*met.gap.shape, len(links))))
         return jnp.concatenate([*each, jnp.stack(scalars, axis=-1), *which], axis=-1)
 
@@ -168,9 +189,9 @@ def _clearance(party: Party, centre: Array) -> Array:
 
 def _onto(party: Party, impulse: Array, lag: Array, arm: Array, lift: Array) -> Hits:
     """What an impulse (B, P, 3) [N s] at an arm and a lift from the ground do to the links of a body."""
-    own = jax.nn.one_hot(party.rows, len(party.body.links), dtype=impulse.dtype)
+    own = picked(jnp.eye(len(party.body.links), dtype=impulse.dtype)[None, party.rows], party.chosen)
     segment = party.segment
     # The ground holds against the lower end.
     foot = -jnp.sign(segment.half[..., 2:]) * segment.half
     push = jnp.concatenate([impulse + lift, jnp.cross(arm, impulse) + jnp.cross(foot, lift)], axis=-1)
-    return Hits(*(jnp.einsum("bpf,pl->blf", each, own) for each in (push, (impulse + lift) * lag)))
+    return Hits(*(jnp.sum(own[..., None] * each[:, :, None], axis=1) for each in (push, (impulse + lift) * lag)))

@@ -39,7 +39,7 @@ STEPS, RUNS, SECONDS = 100, 5, 3.0
 # Steps through which a gradient is taken.
 GRADIENT_STEPS = 60
 # The strike: it begins so many steps before the ball moves, and for so many a link is near the ball.
-BEFORE_STRIKE, STRIKE_STEPS = 1, 4
+BEFORE_STRIKE, STRIKE_STEPS = 1, 3
 # A ball out of reach is so far away [m].
 AWAY = 100.0
 # Spread of the offsets of joint targets [rad].
@@ -113,7 +113,7 @@ def course(question: Question) -> Course:
     """What every engine simulates.
 
     ball: in flight, after the reference's strike. human: the reference. human_ball far: the reference, with the ball
-    100 m away. human_ball struck: the four steps around the strike, in each of which a link is near the ball, over and
+    100 m away. human_ball struck: the three steps around the strike, in each of which a link is near the ball, over and
     over; where a gradient is asked for, the reference from its start, with the strike in it.
     """
     whole = human_and_ball()
