@@ -48,10 +48,8 @@ def evaluate(simulator: Simulator, episodes: Trajectories, windows: Sequence[int
     scene = simulator.scene
     controls, torques = episodes.controls[:, :longest], episodes.torques[:, :longest]
     predicted = predict(simulator, episodes.states[:, 0], controls, torques, episodes.morphology)
+    distance, kept = distances(predicted, episodes, longest)
     true = episodes.states[:, 1 : longest + 1]
-    distance = np.linalg.norm(predicted[..., packed.POSITION] - true[..., packed.POSITION], axis=-1)
-    lost = ~(np.isfinite(distance).all(axis=(1, 2)) & (distance.max(axis=(1, 2)) < DIVERGED))
-    kept = ~lost
     relative = rotation.multiply(
         jnp.asarray(predicted[kept][..., packed.ORIENTATION]),
         rotation.conjugate(jnp.asarray(true[kept][..., packed.ORIENTATION])),
@@ -60,10 +58,7 @@ def evaluate(simulator: Simulator, episodes: Trajectories, windows: Sequence[int
         scene, jnp.asarray(predicted[kept]), jnp.asarray(episodes.morphology[kept][:, None])
     )
     return {
-        "windows": {
-            str(n): {body.name: mean(distance[kept, :n, scene.rows(body.name)]) for body in scene.bodies}
-            for n in windows
-        },
+        "windows": by_window(scene, distance[kept], windows),
         "rotation_rad": {
             body.name: mean(
                 jnp.linalg.norm(rotation.to_rotation_vector(relative[:, :, scene.rows(body.name)]), axis=-1)
@@ -73,9 +68,41 @@ def evaluate(simulator: Simulator, episodes: Trajectories, windows: Sequence[int
         },
         "displacement_m": mean(jnp.linalg.norm(apart, axis=-1)) if apart.shape[-2] else 0.0,
         "sequences": len(episodes.states),
-        "diverged": int(lost.sum()),
+        "diverged": int((~kept).sum()),
         "launch": {str(before): launch(simulator, episodes, before) for before in (0, 3)} if struck(scene) else {},
     }
+
+
+def distances(predicted: np.ndarray, episodes: Trajectories, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """How far links are from the truth, (E, steps, L) [m], and (E,) which episodes were predicted without diverging."""
+    apart = predicted[:, :steps, :, packed.POSITION] - episodes.states[:, 1 : steps + 1, :, packed.POSITION]
+    distance = np.linalg.norm(apart, axis=-1)
+    return distance, np.isfinite(distance).all(axis=(1, 2)) & (distance.max(axis=(1, 2)) < DIVERGED)
+
+
+def by_window(scene: Scene, distance: np.ndarray, windows: Sequence[int]) -> dict[str, dict[str, float | None]]:
+    """Mean distance [m] of every body's links over the first n steps, n in `windows`; of distances (E, H, L)."""
+    return {str(n): {body.name: mean(distance[:, :n, scene.rows(body.name)]) for body in scene.bodies} for n in windows}
+
+
+def second_opinion(scene: Scene, episodes: Trajectories, windows: Sequence[int]) -> dict[str, dict[str, float | None]]:
+    """How far Bullet strays from the truth over the first n steps; see `evaluate`. Needs the extra `bullet`.
+
+    Two engines that agree on the equations differ in how contacts give way and rub: no model of one of them needs to
+    be better than that.
+    """
+    from larp_model.truth.bullet import BulletTruth
+
+    longest, parts = max(windows), []
+    for row in range(len(episodes.states)):
+        own = slice(row, row + 1)
+        world = BulletTruth(scene)
+        world.resize(episodes.morphology[own])
+        given = episodes.controls[own, :longest], episodes.torques[own, :longest]
+        parts.append(world.rollout(episodes.states[own, 0], *given)[0])
+        world.close()
+    distance, kept = distances(np.concatenate(parts), episodes, longest)
+    return by_window(scene, distance[kept], windows)
 
 
 def struck(scene: Scene) -> int | None:

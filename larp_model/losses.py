@@ -72,13 +72,14 @@ def total(
     """The weighted sum and its terms, averaged over states (B, H, L, 13); `emphasis` (L,) weighs the links.
 
     morphology (B or 1, L, 3).
-    Sequences that stray further than `LOST` teach nothing: they are left out, and "lost" is their share.
+    From where a sequence strays further than `LOST` it teaches nothing: that is left out, and "lost" is its share.
     """
     places = position(predicted, true)
-    kept = jax.lax.stop_gradient(jnp.max(places, axis=(1, 2)) < LOST**2).astype(places.dtype)
+    near = jnp.cumprod(jnp.max(places, axis=2) < LOST**2, axis=1)
+    kept = jax.lax.stop_gradient(near).astype(places.dtype)
 
     def mean(values: Array) -> Array:
-        return jnp.sum(kept * jnp.sum(values, axis=(1, 2))) / (jnp.maximum(jnp.sum(kept), 1.0) * places[0].size)
+        return jnp.sum(kept * jnp.sum(values, axis=2)) / (jnp.maximum(jnp.sum(kept), 1.0) * places.shape[2])
 
     terms = {
         "position": mean(emphasis * pseudo_huber(places, weights.far)),

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 from larp_model.bodies import chain, human_and_ball, human_and_capsule, two_balls, two_chains
+from larp_model.designs import DesignName
 from larp_model.scene import Scene
 from larp_model.truth.episodes import Episodes
 from tasks import references
@@ -61,6 +63,11 @@ SCENARIOS = {
         _thrown("two_balls", two_balls(), varied=False),
     )
 }
+
+
+def trained_at(name: str, design: DesignName | None = None) -> Path:
+    """Where a run trains a scene's weights, of its own design or of another."""
+    return Path("runs/train") / "_".join([name, *([design] if design else [])])
 
 
 def scenario(name: str) -> Scenario:

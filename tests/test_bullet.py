@@ -12,11 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
 from larp_model.bodies import ball, capsule, chain, human
+from larp_model.evaluation import second_opinion
 from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface
 from larp_model.truth.bullet import BulletTruth, give, inertia
 from larp_model.truth.mujoco import Truth, compile_model
 from tasks.data import smooth_noise, stray
 from tasks.references import Reference, standing_on_ground
+from tasks.thrown import thrown_episodes
 
 MISSING = "pybullet is not installed: pip install 'larp-mpc[bullet]'"
 
@@ -258,3 +260,18 @@ def test_what_bullet_cannot_do_is_refused(bullet: type[BulletTruth]) -> None:
 def test_counts_must_be_positive(name: str) -> None:
     with pytest.raises(ValueError, match=f"{name} is 0"):
         BulletTruth(Scene((ball(),)), **{name: 0})
+
+
+def test_chains_of_every_size_are_thrown_as_in_the_truth(bullet: type[BulletTruth]) -> None:
+    scene = Scene((chain(links=2),))
+    episodes, _ = thrown_episodes(scene, 4, seed=3, steps=20, varied=True)
+    strayed = second_opinion(scene, episodes, (20,))["20"]["chain"]
+    assert strayed is not None and strayed < 1e-3
+    usual = bullet(scene, 4)
+    there, _ = usual.rollout(episodes.states[:, 0], episodes.controls, episodes.torques)
+    assert apart(there, episodes.states[:, 1:]).mean() > 10.0 * strayed
+
+
+def test_sizes_of_another_batch_are_refused_by_shape(bullet: type[BulletTruth]) -> None:
+    with pytest.raises(ValueError, match=r"morphology has shape \(1, 1, 3\), but needs \(2, 1, 3\)"):
+        bullet(Scene((ball(),)), 2).resize(np.ones((1, 1, 3)))

@@ -92,10 +92,29 @@ def test_weights_that_are_not_shipped_are_refused_with_the_way_to_them(tmp_path:
         model.main(scene="two_balls", json=tmp_path / "model.json")
 
 
+def test_a_design_that_was_not_trained_is_refused_with_the_way_to_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r"beside is paper, .*python -m tasks.train --scene chain4 --design paper"):
+        model.main(scene="chain4", beside="paper", json=tmp_path / "model.json")
+
+
+def test_other_weights_and_the_second_truth_are_rows_beside() -> None:
+    windows = {str(n): {"chain": 0.001 * n} for n in SCENARIOS["chain4"].windows}
+    found = {"windows": windows, "rotation_rad": {"chain": 0.1}, "displacement_m": 0.0, "diverged": 0, "launch": {}}
+    found |= {"sequences": 16, "us_per_step": {"1": 50.0, "64": 3.0, "512": 2.0}, "bullet": windows}
+    table = model.table_of(found | {"beside": {"design": "paper", **found}}, SCENARIOS["chain4"])
+    rows = list(table.columns[0].cells)
+    assert "chain, the paper design trained here" in rows and "chain, Bullet" in rows
+    assert "a step of a scene, the paper design" in rows
+
+
 @pytest.mark.parametrize(("design", "part", "stage"), [(None, Articulated, "steps"), ("paper", PaperBody, "rollouts")])
 def test_a_scene_becomes_weights_and_scores(
-    design: DesignName | None, part: type[BodyPart], stage: str, tmp_path: Path
+    design: DesignName | None, part: type[BodyPart], stage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(model, "BATCHES", (2,))  # every other size is compiled once more
     train.main(scene="chain4", design=design, folder=tmp_path / "run", episodes=64, effort=1e-4)
     manifest = tmp_path / "run/weights/chain4.json"
     made, _, content = stored.load(manifest, SCENARIOS["chain4"].scene)
@@ -106,4 +125,5 @@ def test_a_scene_becomes_weights_and_scores(
     assert found["windows"].keys() == {"10", "40", "80", "190"}
     assert found["sequences"] == 16 and set(found["windows"]["10"]) == {"chain"}
     assert found["launch"] == {}
+    assert found["us_per_step"]["2"] > 0.0
     assert (tmp_path / "model.png").stat().st_size > 1000

@@ -282,3 +282,16 @@ def test_emphasis_weighs_the_links_it_names(scene: Scene, episodes: Episodes) ->
     sizes = morphology_of(scene)[None]
     terms = [losses.total(scene, LossWeights(), weigh, shifted, true, sizes)[1]["position"] for weigh in (even, ball)]
     assert float(terms[1]) == pytest.approx(3.0 * float(terms[0]), rel=1e-5)
+
+
+def test_a_sequence_teaches_until_it_is_lost(scene: Scene, episodes: Episodes) -> None:
+    true = jnp.asarray(episodes.states[:1, :6])
+    strayed = true.at[:, 2:, :, 0].add(0.1).at[:, 4:, :, 0].add(5.0)
+
+    def loss(predicted: Array) -> Array:
+        weigh = jnp.ones(len(scene.links))
+        return losses.total(scene, LossWeights(displacement=0.0), weigh, predicted, true, morphology_of(scene)[None])[0]
+
+    slope = np.asarray(jax.grad(loss)(strayed))[0, :, :, 0]
+    np.testing.assert_allclose(loss(strayed), 0.5 * 0.1**2, rtol=1e-4)
+    assert (slope[2:4] > 0.0).all() and not slope[4:].any()

@@ -336,18 +336,30 @@ class BulletTruth:
         for name, value in (("batch", batch), ("substeps", substeps)):
             if value < 1:
                 raise ValueError(f"{name} is {value!r}, but must be at least 1")
+        self.scene = scene
+        self.substeps = substeps
+        self._fill([scene] * batch)
+
+    def _fill(self, scenes: list[Scene]) -> None:
+        """Make a simulation of each of the scenes."""
         try:
             import pybullet
         except ImportError:
             raise ValueError("pybullet is not installed: pip install 'larp-mpc[bullet]'") from None
-        self.scene = scene
-        self.substeps = substeps
-        soft = _soft_bodies(scene)
-        trees = [_tree(scene, body, body.name in soft) for body in scene.bodies]
-        step = scene.dt / substeps
-        divisions = max(_divisions(body.surface, step) for body in scene.bodies)
-        for _ in range(batch):
+        self.close()
+        step = self.scene.dt / self.substeps
+        divisions = max(_divisions(body.surface, step) for body in self.scene.bodies)
+        for scene in scenes:
+            soft = _soft_bodies(scene)
+            trees = [_tree(scene, body, body.name in soft) for body in scene.bodies]
             self._worlds.append(_World(pybullet, scene, trees, step, divisions))
+
+    def resize(self, morphology: np.ndarray) -> None:
+        """Give the links of each simulation their lengths [m], radii [m] and masses [kg], (N, L, 3); then `reset`."""
+        needed = (self.batch, len(self.scene.links), 3)
+        if np.shape(morphology) != needed:
+            raise ValueError(f"morphology has shape {np.shape(morphology)}, but needs {needed}")
+        self._fill([self.scene.sized(each) for each in morphology])
 
     def close(self) -> None:
         """Give the engine's memory back; the simulations are gone."""

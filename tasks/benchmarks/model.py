@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
 from larp_model import evaluation
 from larp_model import weights as stored
+from larp_model.designs import DesignName
 from larp_model.simulator import Simulator
 from larp_model.truth import episodes as truth_episodes
+from larp_model.truth.episodes import Episodes
 from tasks.benchmarks import report
 from tasks.kick import WEIGHTS, remember_compilations, run
-from tasks.scenarios import Scenario, scenario
+from tasks.scenarios import Scenario, scenario, trained_at
 
+# A step is timed with so many scenes side by side, over so many steps.
+BATCHES, TIMED = (1, 64, 512), 40
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 
 
@@ -56,6 +63,8 @@ def main(
     json: Path | None = None,
     weights: Path | None = None,
     states: Path | None = None,
+    beside: DesignName | None = None,
+    bullet: bool = False,
     publish: bool = False,
 ) -> None:
     """Compare rollouts of the learned simulator with truth episodes from unseen initial states.
@@ -67,6 +76,8 @@ def main(
         json: where the figures go; the picture goes beside them.
         weights: manifest of the weights; the shipped ones by default.
         states: truth episodes (.npz) to evaluate on instead.
+        beside: weights of this design, from where `tasks.train --design` leaves them, on the same episodes.
+        bullet: also how far Bullet, the second truth, strays from the first.
         publish: put the table into RESULTS.md.
     """
     chosen = scenario(scene)
@@ -76,10 +87,20 @@ def main(
     json = json or Path(f"runs/benchmarks/model_{scene}.json")
     report.ready(json, publish)
     remember_compilations()
-    model, learned, _ = stored.load(manifest, chosen.scene)
+    other = trained_at(scene, beside) / "weights" / f"{scene}.json"
+    if beside and not other.is_file():
+        raise ValueError(
+            f"beside is {beside}, but {other} is not there: `python -m tasks.train --scene {scene} --design {beside}`"
+        )
     episodes = chosen.draw(sequences, seed)[0] if states is None else truth_episodes.load(states, chosen.scene)
-    found = evaluation.evaluate(Simulator(model, learned), episodes, chosen.windows)
+    found = judged(manifest, chosen, episodes)
     source = f"--states {states.name}" if states else f"--sequences {sequences} --seed {seed}"
+    if beside:
+        source += f" --beside {beside}"
+        found["beside"] = {"design": beside, **judged(other, chosen, episodes)}
+    if bullet:
+        source += " --bullet"
+        found["bullet"] = evaluation.second_opinion(chosen.scene, episodes, chosen.windows)
     command = f"python -m tasks.benchmarks.model --scene {scene} {source}"
     report.write_json(json, {"command": command, "hardware": report.hardware(), **found})
     title = f"{scene}: {len(episodes.states)} sequences"
@@ -88,6 +109,27 @@ def main(
     report.show(table)
     if publish:
         report.publish(f"model_{scene}", f"Model: {scene}", command, table)
+
+
+def judged(manifest: Path, chosen: Scenario, episodes: Episodes) -> dict[str, Any]:
+    """What `evaluation.evaluate` finds of some weights, and how long a step of them takes."""
+    simulator = Simulator(*stored.load(manifest, chosen.scene)[:2])
+    found = evaluation.evaluate(simulator, episodes, chosen.windows)
+    return found | {"us_per_step": {str(size): step_time(simulator, episodes, size) for size in BATCHES}}
+
+
+def step_time(simulator: Simulator, episodes: Episodes, size: int, runs: int = 5) -> float:
+    """Time of a step of one scene [us], of so many side by side over the first steps of episodes; the median."""
+    rows = np.arange(size) % len(episodes.states)
+    given = episodes.states[rows, 0], episodes.controls[rows, :TIMED], episodes.torques[rows, :TIMED]
+    state, controls, torques, sizes = (jnp.asarray(each) for each in (*given, episodes.morphology[rows]))
+    roll = jax.jit(simulator.rollout)
+    seconds = []
+    for _ in range(runs + 1):  # the first compiles
+        begin = time.perf_counter()
+        roll(state, controls, torques=torques, morphology=sizes).block_until_ready()
+        seconds.append(time.perf_counter() - begin)
+    return 1e6 * float(np.median(seconds[1:])) / (size * controls.shape[1])
 
 
 def said(value: float | None, how: str, unit: str) -> str:
@@ -106,11 +148,22 @@ def table_of(found: dict[str, Any], chosen: Scenario) -> Table:
         table.add_row(f"{body.name}, position error", *errors)
         if body.name in dict(paper):
             table.add_row(f"{body.name}, the paper", *(f"{value:.3f} m" for value in dict(paper)[body.name]))
+        if "beside" in found:
+            other = found["beside"]
+            errors = (said(other["windows"][str(n)][body.name], ".4f", "m") for n in chosen.windows)
+            table.add_row(f"{body.name}, the {other['design']} design trained here", *errors)
+        if "bullet" in found:
+            errors = (said(found["bullet"][str(n)][body.name], ".4f", "m") for n in chosen.windows)
+            table.add_row(f"{body.name}, Bullet", *errors)
     beside = [""] * (len(chosen.windows) - 1)
     for name, turned in found["rotation_rad"].items():
         table.add_row(f"{name}, rotation error", *beside, said(turned, ".3f", "rad"))
     table.add_row("joint displacement", *beside, said(found["displacement_m"], ".5f", "m"))
     table.add_row("diverged", *beside, f"{found['diverged']} of {found['sequences']}")
+    for whose in (found, *([found["beside"]] if "beside" in found else [])):
+        name = f", the {whose['design']} design" if whose is not found else ""
+        cells = (f"{value:.3g} us, {size} side by side" for size, value in whose["us_per_step"].items())
+        table.add_row(f"a step of a scene{name}", *cells)
     for before, launch in found["launch"].items():
         if not launch["count"]:
             continue
