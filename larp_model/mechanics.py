@@ -26,7 +26,7 @@ from jax import Array
 
 from larp_model import rotation
 from larp_model import state as packed
-from larp_model.compliance import moments
+from larp_model.compliance import HELD, moments, stiffening
 from larp_model.kinematics import anchors
 from larp_model.scene import Body, Vector
 
@@ -39,12 +39,13 @@ class Constants:
 
     closing: share of a joint's displacement that a step takes back (J. Baumgarte, Computer Methods 1 (1972)). standing,
     sliding: an end that stands on the ground is held as if by so many times its body's mass, one that slides by so
-    many: held harder, a direction of sliding that is half a step old throws the body.
+    many: held harder, a direction of sliding that is half a step old throws the body. held: see `compliance.HELD`.
     """
 
     closing: float = 0.2
     standing: float = 8.0
     sliding: float = 0.2
+    held: float = HELD
 
 
 class Motion(NamedTuple):
@@ -153,6 +154,28 @@ def free_motion(
     begun = (1.0 - GAMMA) * dt * spin1
     moved = dt * ((1.0 - GAMMA) * velocity1 + GAMMA * velocity2)
     return Motion(*(jnp.moveaxis(each, -1, 0) for each in (velocity2, spin2, moved, begun + h * spin2)))
+
+
+def impulse_response(
+    body: Body, state: Array, push: Array, morphology: Array, constants: Constants = Constants()
+) -> tuple[Array, Array]:
+    """Velocities and spins (B, n, 3) that the links of a body in states (B, n, 13) gain from impulses.
+
+    push (B, n, 6): impulse [N s] and moment [N m s] about each link's centre; morphology (B or 1, n, 3). Joints pass on
+    impulses, and moments as far as servos stiffen them at once; the ground is not asked.
+    """
+    state, push, sizes = (jnp.moveaxis(each, 0, -1) for each in (state, push, morphology))
+    matrices = turns(state[:, packed.ORIENTATION])
+    tied = turned_anchors(body, local_anchors(body, sizes), matrices)
+    still = jnp.zeros_like(push[1:, :3])
+    stiff = np.array([stiffening(joint, constants.held) for joint in body.joints], np.float32).reshape(-1, 1, 1, 1)
+    hold = jnp.broadcast_to(stiff * jnp.eye(3, dtype=push.dtype)[..., None], (*still.shape[:2], 3, still.shape[-1]))
+    levels = [
+        Level(rows, parents, *(each[rows - 1] for each in (*tied, still, still, hold))) for rows, parents in tree(body)
+    ]
+    gained = solve(inertias(body, matrices, sizes), Push(push[:, 3:], push[:, :3]), levels)
+    velocity, spin = (jnp.moveaxis(each, -1, 0) for each in gained)
+    return velocity, spin
 
 
 def tree(body: Body) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -285,13 +308,13 @@ def ground(
         falling = rising - h * gravity
         wanted = (rising - h * surface.stiffness * clearance) / (damped + h**2 * surface.stiffness)
         pressed = wanted - falling  # the change of speed that the ground makes
-        touching = (clearance + h * falling < 0.0) & (pressed > 0.0)
+        bearing = decided(-clearance - h * falling, 1e-5) * decided(pressed, 1e-3)
         sliding = speed * (1.0 - upright)
         slip = jnp.sqrt(jnp.sum(sliding**2, axis=1, keepdims=True) + 1e-8)
-        sticks = slip * (damped - 1.0) / damped <= surface.friction * pressed
+        sticks = decided(surface.friction * pressed - slip * (damped - 1.0) / damped, 1e-3)[:, None]
         along = upright - surface.friction * sliding / slip
         loosely = constants.sliding * along[:, :, None] * along[:, None]
-        hold = (mass * touching)[:, None] * jnp.where(sticks[:, None], constants.standing * unit, loosely)
+        hold = (mass * bearing)[:, None] * (sticks * constants.standing * unit + (1.0 - sticks) * loosely)
         target = mv(hold, sliding / damped + wanted * upright)
         mixed = cross_columns(arm, hold)
         return Inertia(-cross_rows(mixed, arm), mixed, hold), Push(cross(arm, target), target)
@@ -299,6 +322,15 @@ def ground(
     down = radius * upright
     added: tuple[Inertia, Push] = jax.tree.map(jnp.add, end(half - down), end(-half - down))
     return added
+
+
+def decided(value: Array, width: float) -> Array:
+    """0 where a value is negative, 1 from `width` on, and no slope between.
+
+    A compiler works a comparison out anew beside every block of a matrix, and may round otherwise: blocks that are not
+    of one mind make no matrix that is positive. A ramp differs as little as its argument.
+    """
+    return jax.lax.stop_gradient(jnp.clip(value / width, 0.0, 1.0))
 
 
 def solve(inertia: Inertia, push: Push, levels: list[Level]) -> tuple[Array, Array]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from jax import Array
@@ -17,11 +18,11 @@ from larp_model import kinematics, rotation
 from larp_model import state as packed
 from larp_model.bodies import capsule, chain, human, human_and_ball
 from larp_model.compliance import moments
-from larp_model.mechanics import Constants, Motion, free_motion
+from larp_model.mechanics import GAMMA, Constants, Motion, free_motion, impulse_response
 from larp_model.scene import Body, Scene
-from larp_model.truth.mujoco import Truth, closed
+from larp_model.truth.mujoco import Truth, closed, compile_model
 from tasks.references import standing_on_ground
-from tasks.thrown import thrown_starts
+from tasks.thrown import thrown_episodes, thrown_starts
 
 BODIES = (capsule(), chain(links=2), chain(links=4), human())
 COUNT, HIGH = 16, 10.0
@@ -184,6 +185,29 @@ def test_a_joint_that_came_apart_closes_by_its_share(body: Body) -> None:
     np.testing.assert_allclose(gaps(after).sum() / before.sum(), 1.0 - Constants().closing, atol=0.02)
 
 
+def test_impulses_are_answered_as_the_engines_inertia_says(body: Body) -> None:
+    scene, links = Scene((body,)), len(body.links)
+    states, push = starts(body)[0], np.random.default_rng(5).standard_normal((COUNT, links, 6))
+    sizes, at_once = kinematics.morphology_of(scene)[None], Constants(held=0.0)
+    found = jax.jit(partial(impulse_response, body, constants=at_once))(states, push, morphology=sizes)
+    model, truth = compile_model(scene), Truth(scene, COUNT)
+    truth.reset(states)
+    data, inertia = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    for index in range(COUNT):
+        data.qpos[:] = truth.coordinates()[0][index]
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, inertia)
+        jacobians = np.zeros((links, 6, model.nv))
+        for link, jacobian in zip(body.links, jacobians, strict=True):
+            row = model.body(f"{body.name}/{link.name}").id
+            mujoco.mj_jacBody(model, data, jacobian[:3], jacobian[3:], row)
+        gained = np.linalg.solve(inertia, np.einsum("lkv,lk->v", jacobians, push[index]))
+        expected = jacobians @ gained
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(found[0][index], expected[:, :3], atol=1e-5 * scale)
+        np.testing.assert_allclose(found[1][index], expected[:, 3:], atol=1e-5 * scale)
+
+
 def test_a_chain_comes_to_rest_on_the_ground_and_is_given_no_energy() -> None:
     body = chain(links=4)
     states = thrown_starts(np.random.default_rng(0), Scene((body,)), np.tile(Scene((body,)).morphology, (COUNT, 1, 1)))
@@ -244,3 +268,23 @@ def test_light_links_that_bear_on_the_ground_are_moved_alike_in_32_and_64_bits()
             coarse = compiled(body)(*(each.astype(np.float32) for each in (states, *none)))
         assert np.abs(coarse.velocity - fine.velocity).max() < 5e-3
         states = moved(states, fine)
+
+
+def test_an_end_that_just_touches_the_ground_throws_no_body_however_that_is_rounded() -> None:
+    body, rows, h = chain(links=4), 64, GAMMA * 0.01
+    scene = Scene((body,))
+    episodes, _ = thrown_episodes(scene, rows, seed=7, steps=80)
+    states = episodes.states[:, -1]
+    up, reach = np.array([0.0, 0.0, 1.0]), 0.5 * body.links[0].length
+    axes = Rotation.from_quat(states[..., packed.ORIENTATION].reshape(-1, 4), scalar_first=True).apply(up)
+    arms = reach * axes.reshape(rows, 4, 3) * np.array([1.0, -1.0])[:, None, None, None] - body.links[0].radius * up
+    speed = states[..., packed.VELOCITY] + np.cross(states[..., packed.ANGULAR_VELOCITY], arms)
+    deep = (states[..., :3] + arms)[..., 2] + h * (speed[..., 2] - h * scene.gravity)
+    nearest = np.min(np.where(deep > -0.01, deep, np.inf), axis=(0, 2))  # of the ends that are not yet far in it
+    states[..., 2] -= nearest[:, None]
+    shifted = np.repeat(states, 16, axis=0)
+    shifted[..., 2] += np.tile(np.linspace(-4e-8, 4e-8, 16), rows)[:, None]
+    with jax.enable_x64(False):
+        given = shifted, np.zeros((len(shifted), 0, 3)), np.zeros((len(shifted), 4, 3))
+        after = jax.jit(partial(motion_of, body))(*(jnp.asarray(each, jnp.float32) for each in given))
+    assert (np.linalg.norm(after.velocity - shifted[..., packed.VELOCITY], axis=-1) < 5.0).all()
