@@ -129,8 +129,9 @@ def free_motion(
         momentum, mass = mv(inertia.turning, spin), sizes[:, 2:3]
         push = Push(momentum + h * (outside - cross(spin, momentum)), mass * (velocity + h * down))
         tied = turned_anchors(body, local, matrices)
-        pull, hold = servos(body, start, targets, spin, h)
-        bearing = ground(body, turns(start), position[:, 2:] + raised, velocity, spin, sizes, gravity, h, constants)
+        before = turns(start)
+        pull, hold = servos(body, start, before, targets, spin, h)
+        bearing = ground(body, before, position[:, 2:] + raised, velocity, spin, sizes, gravity, h, constants)
         inertia, push = jax.tree.map(jnp.add, (inertia, push), bearing)
         inertia, push, tied, pull, hold = held((inertia, push, tied, pull, hold))
         levels = [
@@ -254,10 +255,13 @@ def inertias(body: Body, matrices: Array, sizes: Array) -> Inertia:
     return Inertia(turning, jnp.zeros_like(turning), moving)
 
 
-def servos(body: Body, orientation: Array, targets: Array, spin: Array, h: float) -> tuple[Array, Array]:
+def servos(
+    body: Body, orientation: Array, matrices: Array, targets: Array, spin: Array, h: float
+) -> tuple[Array, Array]:
     """Pull (n - 1, 3, B) and hold (n - 1, 3, 3, B) of all joints within `h` [s]; see the module's equations.
 
-    orientation (n, 4, B), targets (j, 3, B) [rad], spin (n, 3, B). A servo that is at its limit pulls on, and yields.
+    orientation (n, 4, B) and its matrices (n, 3, 3, B), targets (j, 3, B) [rad], spin (n, 3, B). A servo that is at its
+    limit pulls on, and yields.
     """
     links, batch = len(body.links), spin.shape[-1]
     stiffness, limit, armature, damping = np.zeros((4, links - 1, 1, 1), np.float32)
@@ -269,7 +273,7 @@ def servos(body: Body, orientation: Array, targets: Array, spin: Array, h: float
             stiffness[child], limit[child], armature[child] = motor.stiffness, motor.torque_limit, motor.armature
             motor_rows.append(child)
     parents = np.array([joint.parent for joint in body.joints], int)
-    matrices = turns(orientation[1:])
+    matrices = matrices[1:]
     unit = jnp.eye(3, dtype=spin.dtype)[..., None]
     free = jnp.asarray(armature + h * damping, spin.dtype)
     pull = jnp.asarray(armature, spin.dtype) * (spin[1:] - spin[parents])

@@ -71,6 +71,8 @@ OVER_MECHANICS = replace(
     STEPS, updates=10000, contact_share=0.4, before_contact=5, loss=LOSS._replace(far=0.005, fast=0.02)
 )
 GENERAL = (Stage("steps", "", OVER_MECHANICS),)
+# What is struck there is a body like others, whose response counts like the push.
+STRIKING = (*GENERAL, Stage("impacts", "", replace(IMPACTS, only=("contact", "response"), loss=LOSS)))
 # Algorithm 1 of the paper, with its losses; in small batches, which are the most updates that two cores give. Where the
 # unroll grows by more at once, what worked for a few steps runs away within more.
 GROWING = ((2, 0.1), (3, 0.05), (4, 0.05), (6, 0.1), (8, 0.1), (11, 0.1), (14, 0.1), (17, 0.1), (20, 0.3))
@@ -160,7 +162,7 @@ def main(
     remember_compilations()
     design = design or ("compact" if chosen.name == WEIGHTS else "hybrid")
     kick = prepare() if (chosen.name, design) == (WEIGHTS, "compact") else None
-    stages = PAPER if design == "paper" else KICK if kick else GENERAL
+    stages = PAPER if design == "paper" else KICK if kick else STRIKING if chosen.strikes else GENERAL
     model = designs.DESIGNS[design](chosen.scene)
     random = stored_episodes(folder / "random.npz", chosen.scene, lambda: chosen.draw(episodes, seed), console)
     sources = [random]

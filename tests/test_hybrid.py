@@ -13,10 +13,12 @@ import pytest
 from larp_model import designs, rotation
 from larp_model import state as packed
 from larp_model import weights as stored
-from larp_model.bodies import two_chains
+from larp_model.bodies import capsule, two_chains
+from larp_model.kinematics import kinematics, morphology_of
 from larp_model.parts.articulated import Articulated
 from larp_model.parts.bases import OverMechanics
-from larp_model.parts.part import initial_weights, measure
+from larp_model.parts.part import Hits, initial_weights, measure
+from larp_model.scene import Scene
 from larp_model.simulator import Simulator, rollout
 from larp_model.training import first_contacts
 from tasks.scenarios import scenario
@@ -105,3 +107,16 @@ def test_what_the_base_is_survives_on_disk(simulator: Simulator, tmp_path: Path)
     manifest = stored.save(tmp_path, "tiny", MODEL, simulator.weights, {})
     part = stored.load(manifest, SCENE)[0].bodies[0]
     assert isinstance(part, Articulated) and part.base == OverMechanics()
+
+
+def test_a_push_changes_a_capsule_by_its_mass_from_when_it_acts() -> None:
+    body = capsule()
+    scene, upright = Scene((body,)), np.zeros((1, 1, packed.SIZE))
+    upright[..., 2], upright[..., 3] = 2.0, 1.0
+    seen = kinematics(scene, jnp.asarray(upright), morphology_of(scene)[None].astype(float))
+    impulse = jnp.array((0.3, 0.0, -0.2))
+    hits = Hits(jnp.zeros((1, 1, 6)).at[..., :3].set(impulse), 0.007 * jnp.ones((1, 1, 3)) * impulse)
+    faster, _, moved, _ = OverMechanics().answer(body, seen, hits, 0.01)[0, :, 0]
+    np.testing.assert_allclose(faster, impulse / body.links[0].mass, atol=1e-6)
+    # Half the step is what the trapezoidal step has already.
+    np.testing.assert_allclose(moved, 0.002 * impulse / body.links[0].mass, atol=1e-9)

@@ -40,10 +40,13 @@ class Base(Protocol):
     def begin(self, body: Body, seen: Kinematics, control: Array, torque: Array, gravity: float, dt: float) -> Known:
         """What is known of a body that nothing but the ground touches."""
 
+    def answer(self, body: Body, seen: Kinematics, hits: Hits, dt: float) -> Array:
+        """What is known of what contacts add to the changes, (B or 1, 4 or 1, n or 1, 3)."""
+
 
 @dataclass(frozen=True)
 class Response:
-    """What impulses do to a body: a network that adds to the other's answer, and nothing where there are none.
+    """What impulses do to a body: a network that adds to what is known, and nothing where there are none.
 
     felt: impulse from which it is heard in full [N s]. scale: of an impulse [N s] and its moment [N m s], as inputs.
     """
@@ -110,7 +113,7 @@ class Articulated:
                 outputs = evaluate(self.networks()[self.response_name], weights, self.response_name, inputs)
                 felt = jnp.tanh(contact.norm(hits.push[..., :3]).sum(axis=-1, keepdims=True) / response.felt)
                 outputs = weights.outputs[self.name].spread * bounded(outputs, self.bound) * felt
-                return changes + to_world(outputs, known.turn)
+                return changes + self.base.answer(self.body, seen, hits, self.dt) + to_world(outputs, known.turn)
 
             changes = jax.lax.cond(jnp.any(hits.push != 0.0), answer, lambda: changes)
         return integrate(seen.state, changes, self.dt)

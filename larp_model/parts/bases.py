@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model import mechanics, rotation
+from larp_model import contact, mechanics, rotation
 from larp_model import state as packed
 from larp_model.kinematics import Kinematics, apply, ends_on_ground
 from larp_model.meeting import Velocities
 from larp_model.networks import side_by_side
 from larp_model.parts.articulated import Known, changes_of
+from larp_model.parts.part import Hits
 from larp_model.scene import Body
 
 
@@ -33,6 +34,10 @@ class FromNothing:
         vectors += [velocities, *([servo_torques(body, seen, control)] if body.motors else [])]
         turned = rotation.about_z(jnp.concatenate(vectors, axis=1), rotation.opposite(turn)[:, None])
         return Known(jnp.zeros((1, 1, 1, 3), seen.state.dtype), turn, side_by_side(turned, *scalars, ends))
+
+    def answer(self, body: Body, seen: Kinematics, hits: Hits, dt: float) -> Array:
+        """See `Base`: nothing is known."""
+        return jnp.zeros((1, 1, 1, 3), seen.state.dtype)
 
 
 @dataclass(frozen=True)
@@ -62,6 +67,14 @@ class OverMechanics:
         inputs = side_by_side(turned, position[..., 2], sizes, ends)
         after = Velocities(free.velocity, free.spin)
         return Known(changes_of(state, after, free.moved, free.turned, dt), turn, inputs)
+
+    def answer(self, body: Body, seen: Kinematics, hits: Hits, dt: float) -> Array:
+        """See `Base`. All impulses together act on positions for as long as they do on average."""
+        push = hits.push
+        gained = jnp.stack(mechanics.impulse_response(body, seen.state, push, seen.morphology, self.constants), axis=1)
+        impulse, travel = (contact.norm(each).sum(axis=-1) for each in (push[..., :3], hits.travel))
+        acting = (travel / jnp.maximum(impulse, 1e-6))[:, None, None, None]
+        return jnp.concatenate([gained, (acting - 0.5 * dt) * gained], axis=1)
 
 
 def paper_inputs(body: Body, seen: Kinematics, control: Array, torque: Array) -> tuple[list[Array], list[Array]]:
