@@ -41,14 +41,18 @@ train: $(READY)
 	@$(RUN) tasks.train
 
 KICK := $(RUN) tasks.benchmarks.kick --seed 7 --publish
+MODEL := $(RUN) tasks.benchmarks.model --sequences 256 --publish
 
 bench: $(READY)
 	$(RUN) tasks.benchmarks.speed --publish
 	$(RUN) tasks.benchmarks.tradeoff --publish
 	$(RUN) tasks.benchmarks.optimizers --publish
 	$(RUN) tasks.benchmarks.stability --publish
-	$(RUN) tasks.benchmarks.model --scene human_ball --sequences 256 --seed 1 --publish
-	for scene in chains1 chains2 chain4; do $(RUN) tasks.benchmarks.model --publish --scene $$scene --sequences 256 --seed 2 || exit; done
+	for scene in chains1 chains2 human_ball; do $(RUN) tasks.train --scene $$scene --design paper --effort 0.5 || exit; done
+	$(MODEL) --scene human_ball --seed 1 --beside paper
+	for scene in chains1 chains2; do $(MODEL) --scene $$scene --seed 2 --beside paper --bullet || exit; done
+	$(MODEL) --scene chain4 --seed 2 --bullet
+	$(MODEL) --scene human_capsule --seed 2
 	$(RUN) tasks.benchmarks.gap --targets 8 --seed 7 --publish
 	for preset in fast balanced accurate; do $(RUN) tasks.benchmarks.kick --publish --targets 64 --seed 11 --preset $$preset || exit; done
 	for preset in fast balanced accurate; do $(KICK) --targets 32 --preset $$preset --substeps 20 || exit; done

@@ -85,26 +85,6 @@ def by_window(scene: Scene, distance: np.ndarray, windows: Sequence[int]) -> dic
     return {str(n): {body.name: mean(distance[:, :n, scene.rows(body.name)]) for body in scene.bodies} for n in windows}
 
 
-def second_opinion(scene: Scene, episodes: Trajectories, windows: Sequence[int]) -> dict[str, dict[str, float | None]]:
-    """How far Bullet strays from the truth over the first n steps; see `evaluate`. Needs the extra `bullet`.
-
-    Two engines that agree on the equations differ in how contacts give way and rub: no model of one of them needs to
-    be better than that.
-    """
-    from larp_model.truth.bullet import BulletTruth
-
-    longest, parts = max(windows), []
-    for row in range(len(episodes.states)):
-        own = slice(row, row + 1)
-        world = BulletTruth(scene)
-        world.resize(episodes.morphology[own])
-        given = episodes.controls[own, :longest], episodes.torques[own, :longest]
-        parts.append(world.rollout(episodes.states[own, 0], *given)[0])
-        world.close()
-    distance, kept = distances(np.concatenate(parts), episodes, longest)
-    return by_window(scene, distance[kept], windows)
-
-
 def struck(scene: Scene) -> int | None:
     """The row of the link that others strike, if there is one: the second body of the first pair, if of one link."""
     for pair in scene.pairs[:1]:

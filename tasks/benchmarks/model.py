@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,10 @@ from rich.table import Table
 from larp_model import evaluation
 from larp_model import weights as stored
 from larp_model.designs import DesignName
+from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from larp_model.truth import episodes as truth_episodes
+from larp_model.truth.bullet import BulletTruth
 from larp_model.truth.episodes import Episodes
 from tasks.benchmarks import report
 from tasks.kick import WEIGHTS, remember_compilations, run
@@ -100,7 +103,7 @@ def main(
         found["beside"] = {"design": beside, **judged(other, chosen, episodes)}
     if bullet:
         source += " --bullet"
-        found["bullet"] = evaluation.second_opinion(chosen.scene, episodes, chosen.windows)
+        found["bullet"] = second_opinion(chosen.scene, episodes, chosen.windows)
     command = f"python -m tasks.benchmarks.model --scene {scene} {source}"
     report.write_json(json, {"command": command, "hardware": report.hardware(), **found})
     title = f"{scene}: {len(episodes.states)} sequences"
@@ -116,6 +119,24 @@ def judged(manifest: Path, chosen: Scenario, episodes: Episodes) -> dict[str, An
     simulator = Simulator(*stored.load(manifest, chosen.scene)[:2])
     found = evaluation.evaluate(simulator, episodes, chosen.windows)
     return found | {"us_per_step": {str(size): step_time(simulator, episodes, size) for size in BATCHES}}
+
+
+def second_opinion(scene: Scene, episodes: Episodes, windows: Sequence[int]) -> dict[str, dict[str, float | None]]:
+    """How far Bullet strays from the truth over the first n steps; see `evaluate`. Needs the extra `bullet`.
+
+    Two engines that agree on the equations differ in how contacts give way and rub: no model of one of them needs to
+    be better than that.
+    """
+    longest, parts = max(windows), []
+    for row in range(len(episodes.states)):
+        own = slice(row, row + 1)
+        world = BulletTruth(scene)
+        world.resize(episodes.morphology[own])
+        given = episodes.controls[own, :longest], episodes.torques[own, :longest]
+        parts.append(world.rollout(episodes.states[own, 0], *given)[0])
+        world.close()
+    distance, kept = evaluation.distances(np.concatenate(parts), episodes, longest)
+    return evaluation.by_window(scene, distance[kept], windows)
 
 
 def step_time(simulator: Simulator, episodes: Episodes, size: int, runs: int = 5) -> float:
