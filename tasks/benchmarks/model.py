@@ -122,7 +122,7 @@ def judged(manifest: Path, chosen: Scenario, episodes: Episodes) -> dict[str, An
 
 
 def second_opinion(scene: Scene, episodes: Episodes, windows: Sequence[int]) -> dict[str, dict[str, float | None]]:
-    """How far Bullet strays from the truth over the first n steps; see `evaluate`. Needs the extra `bullet`.
+    """How far Bullet strays from the truth over the first n steps; see `evaluation.evaluate`. Needs the extra `bullet`.
 
     Two engines that agree on the equations differ in how contacts give way and rub: no model of one of them needs to
     be better than that.
@@ -130,8 +130,7 @@ def second_opinion(scene: Scene, episodes: Episodes, windows: Sequence[int]) -> 
     longest, parts = max(windows), []
     for row in range(len(episodes.states)):
         own = slice(row, row + 1)
-        world = BulletTruth(scene)
-        world.resize(episodes.morphology[own])
+        world = BulletTruth(scene.sized(episodes.morphology[row]))
         given = episodes.controls[own, :longest], episodes.torques[own, :longest]
         parts.append(world.rollout(episodes.states[own, 0], *given)[0])
         world.close()
