@@ -8,7 +8,8 @@ R. Contini, "Body segment parameters" (1966), as in D. Winter, "Biomechanics and
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+
+import numpy as np
 
 from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface, Vector
 
@@ -87,8 +88,8 @@ def human(
 ) -> Body:
     """A human of 13 links, standing upright in its rest pose, facing x, left towards y.
 
-    height [m] and mass [kg] scale every segment and, by mass times height, the motors. `lengths` and `radii` multiply
-    single segments, by segment name without its side ("thigh", "foot", ...).
+    height [m] and mass [kg] scale every segment. `lengths` and `radii` multiply single segments, by segment name
+    without its side ("thigh", "foot", ...). Motors are in proportion: see `Body.sized`.
     """
     _positive(height=height, mass=mass)
     lengths, radii = dict(lengths or {}), dict(radii or {})
@@ -97,27 +98,36 @@ def human(
             if segment not in _MASS:
                 raise ValueError(f"{argument} names {segment!r}, but the segments are {sorted(_MASS)}")
             _positive(**{f"{argument}[{segment!r}]": factor})
-    strength = mass * height / (70.0 * 1.75)
+    usual, size = _usual_human(name), height / 1.75
+    sizes = [
+        (
+            size * lengths.get(segment, 1.0) * link.length,
+            size * radii.get(segment, 1.0) * link.radius,
+            mass * _MASS[segment],
+        )
+        for link in usual.links
+        for segment in [segment_of(link.name)]
+    ]
+    return usual.sized(np.array(sizes))
+
+
+def segment_of(link: str) -> str:
+    """The name of a human's link without its side."""
+    return link.removeprefix("left_").removeprefix("right_")
+
+
+def _usual_human(name: str) -> Body:
+    """A human of 1.75 m and 70 kg; its joints are at the heights that Winter gives, to 1 cm."""
 
     def link(name: str, length: float, radius: float, axis: Vector = (0.0, 0.0, 1.0)) -> Link:
-        segment = name.removeprefix("left_").removeprefix("right_")
-        size = height / 1.75
-        return Link(
-            name,
-            length * size * lengths.get(segment, 1.0),
-            radius * size * radii.get(segment, 1.0),
-            mass * _MASS[segment],
-            axis,
-        )
+        return Link(name, length, radius, 70.0 * _MASS[segment_of(name)], axis)
 
     def joint(child: str, parent: int, parent_anchor: Vector, child_anchor: Vector) -> Joint:
-        stiffness, damping, torque, lower, upper = _MOTOR[child.removeprefix("left_").removeprefix("right_")]
-        motor = Motor(strength * stiffness, strength * damping, strength * torque, lower, upper, strength * ARMATURE)
+        stiffness, damping, limit, lower, upper = _MOTOR[segment_of(child)]
         if child.startswith("right_"):  # mirroring y turns roll and yaw round
-            motor = replace(motor, lower=(-upper[0], lower[1], -upper[2]), upper=(-lower[0], upper[1], -lower[2]))
-        return Joint(parent, parent_anchor, child_anchor, motor)
+            lower, upper = (-upper[0], lower[1], -upper[2]), (-lower[0], upper[1], -lower[2])
+        return Joint(parent, parent_anchor, child_anchor, Motor(stiffness, damping, limit, lower, upper, ARMATURE))
 
-    # Lengths and radii in metres of a human of 1.75 m; its joints are at the heights that Winter gives, to 1 cm.
     links = [
         link("pelvis", 0.14, 0.10, (0.0, 1.0, 0.0)),
         link("torso", 0.315, 0.12),

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model.kinematics import anchors, picked
+from larp_model.kinematics import anchors, picked, strength
 from larp_model.scene import Body, Joint, Vector
 
 # For how long a motor's damping acts during an impact, as far as its armature-like effect goes [s].
@@ -33,10 +33,13 @@ def moments(length: Array, radius: Array, mass: Array) -> tuple[Array, Array]:
     return along, across
 
 
-def stiffening(joint: Joint, held: float) -> float:
-    """Moment that a joint takes up during an impact per spin that its links part with [kg m^2]."""
+def stiffening(joint: Joint, held: float, strength: Array) -> Array | float:
+    """Moment that a joint takes up during an impact per spin that its links part with [kg m^2], (*,) or ().
+
+    strength: (*,), see `kinematics.strength`.
+    """
     motor = joint.motor
-    return held * joint.damping if motor is None else motor.armature + held * motor.damping
+    return held * joint.damping if motor is None else strength * (motor.armature + held * motor.damping)
 
 
 def compliance(
@@ -50,6 +53,7 @@ def compliance(
     K, 3) are of; see `kinematics.picked`.
     """
     known: dict[int, tuple[Array, Array, Array, Array]] = {}
+    stronger = strength(body, morphology)
     identity = jnp.eye(3, dtype=matrices.dtype)
 
     def place(row: int, point: Vector) -> Array:
@@ -61,7 +65,7 @@ def compliance(
         if row not in known:
             length, radius, mass = (morphology[..., row, column] for column in range(3))
             along, across = moments(length, radius, mass)
-            stiffer = stiffening(body.joints[row - 1], held) if row else 0.0
+            stiffer = stiffening(body.joints[row - 1], held, stronger) if row else 0.0
             along, across = (along + stiffer)[..., None, None], (across + stiffer)[..., None, None]
             axis = matrices[..., row, :, :] @ jnp.asarray(body.links[row].axis, matrices.dtype)
             outer = axis[..., :, None] * axis[..., None, :]

@@ -14,7 +14,7 @@ from jax import Array
 from larp_model import rotation
 from larp_model import state as packed
 from larp_model.contact import Segment
-from larp_model.scene import Scene, Vector
+from larp_model.scene import Body, Scene, Vector
 
 
 class Kinematics(NamedTuple):
@@ -77,6 +77,11 @@ def picked(values: Array, chosen: Array | None) -> Array:
 def morphology_of(scene: Scene) -> Array:
     """The morphology (L, 3) that the scene has by itself."""
     return jnp.asarray(scene.morphology)
+
+
+def strength(body: Body, morphology: Array) -> Array:
+    """How many times as strong (*,) the motors of a morphology (*, n, 3) are as the body's own: see `Body.sized`."""
+    return jnp.sum(morphology[..., 0], axis=-1) * jnp.sum(morphology[..., 2], axis=-1) / body.weighed
 
 
 def anchors(points: list[Vector], axes: list[Vector], morphology: Array) -> Array:

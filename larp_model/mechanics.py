@@ -27,7 +27,7 @@ from jax import Array
 from larp_model import rotation
 from larp_model import state as packed
 from larp_model.compliance import HELD, moments, stiffening
-from larp_model.kinematics import anchors
+from larp_model.kinematics import anchors, strength
 from larp_model.scene import Body, Vector
 
 GAMMA = 1.0 - math.sqrt(0.5)
@@ -115,7 +115,7 @@ def free_motion(
     position, orientation, velocity, spin = (
         state[:, columns] for columns in (packed.POSITION, packed.ORIENTATION, packed.VELOCITY, packed.ANGULAR_VELOCITY)
     )
-    local = local_anchors(body, sizes)
+    local, stronger = local_anchors(body, sizes), strength(body, morphology)
     child, parent = turned_anchors(body, local, turns(orientation))
     parents = np.array([joint.parent for joint in body.joints], int)
     gap = position[parents] + parent - (position[1:] + child)
@@ -130,7 +130,7 @@ def free_motion(
         push = Push(momentum + h * (outside - cross(spin, momentum)), mass * (velocity + h * down))
         tied = turned_anchors(body, local, matrices)
         before = turns(start)
-        pull, hold = servos(body, start, before, targets, spin, h)
+        pull, hold = servos(body, start, before, targets, spin, h, stronger)
         bearing = ground(body, before, position[:, 2:] + raised, velocity, spin, sizes, gravity, h, constants)
         inertia, push = jax.tree.map(jnp.add, (inertia, push), bearing)
         inertia, push, tied, pull, hold = held((inertia, push, tied, pull, hold))
@@ -169,8 +169,9 @@ def impulse_response(
     matrices = turns(state[:, packed.ORIENTATION])
     tied = turned_anchors(body, local_anchors(body, sizes), matrices)
     still = jnp.zeros_like(push[1:, :3])
-    stiff = np.array([stiffening(joint, constants.held) for joint in body.joints], np.float32).reshape(-1, 1, 1, 1)
-    hold = jnp.broadcast_to(stiff * jnp.eye(3, dtype=push.dtype)[..., None], (*still.shape[:2], 3, still.shape[-1]))
+    stronger = strength(body, morphology)
+    stiff = [jnp.broadcast_to(stiffening(each, constants.held, stronger), push.shape[-1:]) for each in body.joints]
+    hold = jnp.reshape(jnp.array(stiff), (-1, 1, 1, push.shape[-1])) * jnp.eye(3, dtype=push.dtype)[..., None]
     levels = [
         Level(rows, parents, *(each[rows - 1] for each in (*tied, still, still, hold))) for rows, parents in tree(body)
     ]
@@ -256,33 +257,35 @@ def inertias(body: Body, matrices: Array, sizes: Array) -> Inertia:
 
 
 def servos(
-    body: Body, orientation: Array, matrices: Array, targets: Array, spin: Array, h: float
+    body: Body, orientation: Array, matrices: Array, targets: Array, spin: Array, h: float, stronger: Array
 ) -> tuple[Array, Array]:
     """Pull (n - 1, 3, B) and hold (n - 1, 3, 3, B) of all joints within `h` [s]; see the module's equations.
 
-    orientation (n, 4, B) and its matrices (n, 3, 3, B), targets (j, 3, B) [rad], spin (n, 3, B). A servo that is at its
-    limit pulls on, and yields.
+    orientation (n, 4, B) and its matrices (n, 3, 3, B), targets (j, 3, B) [rad], spin (n, 3, B); stronger (B or 1,) is
+    `kinematics.strength`. A servo that is at its limit pulls on, and yields.
     """
     links, batch = len(body.links), spin.shape[-1]
-    stiffness, limit, armature, damping = np.zeros((4, links - 1, 1, 1), np.float32)
+    motors, passive = np.zeros((4, links - 1, 1, 1), np.float32), np.zeros((links - 1, 1, 1), np.float32)
     aim, motor_rows = jnp.zeros((links - 1, 3, batch), spin.dtype), []
     for child, joint in enumerate(body.joints):
         motor = joint.motor
-        damping[child] = joint.damping if motor is None else motor.damping
-        if motor is not None:
-            stiffness[child], limit[child], armature[child] = motor.stiffness, motor.torque_limit, motor.armature
+        if motor is None:
+            passive[child] = joint.damping
+        else:
+            motors[:, child, 0, 0] = motor.stiffness, motor.torque_limit, motor.armature, motor.damping
             motor_rows.append(child)
+    stiffness, limit, armature, damping = stronger * jnp.asarray(motors)
     parents = np.array([joint.parent for joint in body.joints], int)
     matrices = matrices[1:]
     unit = jnp.eye(3, dtype=spin.dtype)[..., None]
-    free = jnp.asarray(armature + h * damping, spin.dtype)
-    pull = jnp.asarray(armature, spin.dtype) * (spin[1:] - spin[parents])
+    free = armature + h * (damping + passive)
+    pull = armature * (spin[1:] - spin[parents])
     if not motor_rows:
-        return pull, jnp.broadcast_to(free[..., None] * unit, (links - 1, 3, 3, batch))
+        return pull, jnp.broadcast_to(free[:, :, None] * unit, (links - 1, 3, 3, batch))
     aim = aim.at[np.array(motor_rows)].set(targets)
     wanted = stiffness * (aim - angles(orientation[parents], orientation[1:]))
     giving = h**2 * stiffness * (jnp.abs(wanted) < limit)
-    hold = mm(matrices * giving[:, None], jnp.swapaxes(matrices, 1, 2)) + free[..., None] * unit
+    hold = mm(matrices * giving[:, None], jnp.swapaxes(matrices, 1, 2)) + free[:, :, None] * unit
     return pull + h * mv(matrices, jnp.clip(wanted, -limit, limit)), hold
 
 

@@ -77,6 +77,11 @@ class Motor:
         if any(low > high for low, high in zip(self.lower, self.upper, strict=True)):
             raise ValueError(f"motor.lower is {self.lower!r}, but must not exceed motor.upper {self.upper!r}")
 
+    def times(self, factor: float) -> Motor:
+        """A motor so many times as strong, stiff and heavy."""
+        changed = {name: factor * getattr(self, name) for name in ("stiffness", "damping", "torque_limit", "armature")}
+        return replace(self, **changed)
+
 
 @dataclass(frozen=True)
 class Joint:
@@ -164,6 +169,31 @@ class Body:
     def motors(self) -> tuple[tuple[int, Joint, Motor], ...]:
         """(child link, joint, motor) of each motorised joint."""
         return tuple((i, j, j.motor) for i, j in enumerate(self.joints, start=1) if j.motor is not None)
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """Length [m], radius [m] and mass [kg] of every link, (n, 3)."""
+        return np.array([(link.length, link.radius, link.mass) for link in self.links])
+
+    @property
+    def weighed(self) -> float:
+        """The mass [kg] of all links times their length [m], to which motors are in proportion."""
+        return sum(link.mass for link in self.links) * sum(link.length for link in self.links)
+
+    def sized(self, sizes: np.ndarray) -> Body:
+        """The body with links of these lengths [m], radii [m] and masses [kg], (n, 3), and motors in proportion."""
+        links = tuple(
+            replace(link, length=length, radius=radius, mass=mass)
+            for link, (length, radius, mass) in zip(self.links, np.asarray(sizes, float).tolist(), strict=True)
+        )
+        larger = replace(self, links=links)
+        if not self.motors:
+            return larger
+        factor = larger.weighed / self.weighed
+        joints = (
+            joint if joint.motor is None else replace(joint, motor=joint.motor.times(factor)) for joint in self.joints
+        )
+        return replace(larger, joints=tuple(joints))
 
     def link(self, name: str) -> int:
         """Index of a link by name."""
@@ -269,16 +299,11 @@ class Scene:
                 yield start + child, start + joint.parent, joint
 
     def sized(self, morphology: np.ndarray) -> Scene:
-        """The scene with links of these lengths [m], radii [m] and masses [kg], (L, 3)."""
+        """The scene with links of these lengths [m], radii [m] and masses [kg], (L, 3): see `Body.sized`."""
         sizes = np.asarray(morphology, float)
         if sizes.shape != (len(self.links), 3):
             raise ValueError(f"morphology has shape {sizes.shape}, but needs ({len(self.links)}, 3)")
-        bodies = []
-        for body in self.bodies:
-            own = zip(body.links, sizes[self.rows(body.name)].tolist(), strict=True)
-            links = (replace(link, length=length, radius=radius, mass=mass) for link, (length, radius, mass) in own)
-            bodies.append(replace(body, links=tuple(links)))
-        return replace(self, bodies=tuple(bodies))
+        return replace(self, bodies=tuple(body.sized(sizes[self.rows(body.name)]) for body in self.bodies))
 
     def only(self, *names: str) -> Scene:
         """The scene with these bodies alone."""

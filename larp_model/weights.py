@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -222,14 +223,14 @@ def _bodies_differ(body: Body, own: Body, trained: Trained) -> Iterator[str]:
             if not low * (1.0 - 1e-5) - 1e-6 <= value <= high * (1.0 + 1e-5) + 1e-6:
                 span = f"{low:.6g}" if low == high else f"{low:.6g} to {high:.6g}"
                 yield f"{body.name}.{link.name}.{name} is {value:.6g}, but they were trained on {span}"
-    for joint, before, link in zip(body.joints, own.joints, body.links[1:], strict=True):
+    for joint, before, link in zip(body.joints, own.sized(body.sizes).joints, body.links[1:], strict=True):
         yield from _differ(f"the joint of {body.name}.{link.name}", joint, before)
     yield from _differ(f"{body.name}.surface", body.surface, own.surface)
 
 
 def _differ(what: str, now: Any, was: Any) -> Iterator[str]:
-    """The fields in which two things differ, or the things where they have none."""
-    if now == was:
+    """The fields in which two things differ, or the things where they have none; rounding apart."""
+    if now == was or (isinstance(now, float) and math.isclose(now, was, rel_tol=1e-5)):
         return
     if dataclasses.is_dataclass(now) and dataclasses.is_dataclass(was):
         for field in dataclasses.fields(now):

@@ -8,13 +8,15 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
+from larp_model.bodies import segment_of
 from larp_model.kinematics import morphology_of
 from larp_model.meeting import meetings
 from larp_model.scene import Link, Scene
 from larp_model.training import first_contacts
 from larp_model.truth.episodes import Episodes, record
 from larp_model.truth.mujoco import Truth, closed
-from tasks.references import Reference
+from tasks.motions.people import random_people
+from tasks.references import Reference, clearance, resting
 
 STEPS, CONTACT_STEPS = 70, 10
 # How far random joint targets stray from the reference, standard deviation by segment [rad]; the planner's too.
@@ -39,9 +41,8 @@ def stray(scene: Scene) -> np.ndarray:
     rows = []
     for body in scene.bodies:
         for child, _, motor in body.motors:
-            segment = body.links[child].name.removeprefix("left_").removeprefix("right_")
             free = np.subtract(motor.upper, motor.lower) > 0.45
-            rows.append(STRAY[segment] * np.where(free, 1.0, 0.2))
+            rows.append(STRAY[segment_of(body.links[child].name)] * np.where(free, 1.0, 0.2))
     return np.array(rows)
 
 
@@ -52,12 +53,13 @@ def smooth_noise(random: np.random.Generator, count: int, steps: int, knots: int
 
 
 def random_starts(
-    random: np.random.Generator, scene: Scene, reference: Reference, count: int, steps: int
-) -> tuple[np.ndarray, np.ndarray]:
+    random: np.random.Generator, scene: Scene, reference: Reference, count: int, steps: int,
+    sizes: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """States (count, L, 13) along the reference, disturbed and turned about z, and the steps (count,) they come from.
 
     What the human may strike, if anything, waits where a foot will pass, or near the ball's spot, or comes from
-    anywhere.
+    anywhere. sizes: (count, L, 3) of other bodies, who are as far above the ground as the reference is.
     """
     latest = len(reference.controls) - steps - 1
     from_start = random.random(count) < 0.5
@@ -73,22 +75,33 @@ def random_starts(
     states[:, rows, packed.ANGULAR_VELOCITY] += 1.0 * size * random.standard_normal((count, human, 3))
     states[:, rows.start, packed.VELOCITY] += 0.3 * size[:, 0] * random.standard_normal((count, 3))
     states[:, rows, 2] += 0.02 * size[:, 0] * random.random((count, 1))
-    states[:, rows] = closed(scene.only("human"), states[:, rows])
+    if sizes is None:
+        larger = np.ones((count, 1, 1))
+        states[:, rows] = closed(scene.only("human"), states[:, rows])
+    else:
+        body, usual = scene.body("human"), np.broadcast_to(scene.morphology[rows], (count, human, 3))
+        larger = (sizes[:, rows, 0].sum(axis=1) / usual[..., 0].sum(axis=1))[:, None, None]
+        above = clearance(body, states[:, rows], usual)
+        states[:, rows] = closed(scene.only("human"), states[:, rows], sizes[:, rows])
+        states[:, rows, 2] += (above - clearance(body, states[:, rows], sizes[:, rows]))[:, None]
     for pair in scene.pairs:
         struck = scene.index(pair.second, pair.second_links[0])
-        states[:, struck] = random_places(random, scene, reference, struck, begin, steps)
-        # What is inside a leg is no initial state: it waits out of reach instead.
-        inside = overlaps(scene, states)
-        states[inside, struck, :2] = (3.0, 0.0)
-        states[inside, struck, 2] = resting(scene.links[struck], states[inside, struck])
-    return _turn(states, random.uniform(-np.pi, np.pi, count)), begin
+        foot = scene.index("human", "right_foot")
+        paths = larger * reference.states[begin[:, None] + np.arange(steps), foot, :3]
+        spot = larger[:, 0] * reference.ball_spot[:2]
+        states[:, struck] = random_places(random, scene.links[struck], spot, paths, scene.dt)
+        states = out_of_legs(scene, states, sizes)
+    return turned_about_z(states, random.uniform(-np.pi, np.pi, count)), begin
 
 
 def random_places(
-    random: np.random.Generator, scene: Scene, reference: Reference, row: int, begin: np.ndarray, steps: int
+    random: np.random.Generator, link: Link, spot: np.ndarray, paths: np.ndarray, dt: float
 ) -> np.ndarray:
-    """States (count, 13) of a link that the human may strike within so many `steps` from `begin` (count,) on."""
-    count, link = len(begin), scene.links[row]
+    """States (count, 13) of a link that a human may strike whose feet go along paths (count, steps, 3) [m].
+
+    It waits near the spot (2,) or (count, 2) [m], or where the foot will pass, or comes from anywhere.
+    """
+    count, steps = len(paths), paths.shape[1]
     found = np.zeros((count, packed.SIZE))
     found[:, packed.ORIENTATION] = (1.0, 0.0, 0.0, 0.0)
     if link.length:
@@ -101,18 +114,17 @@ def random_places(
         )
     lowest = resting(link, found)
     kind = random.random(count)
-    found[:, :2] = reference.ball_spot[:2] + random.uniform(-0.06, 0.06, (count, 2))
+    found[:, :2] = spot + random.uniform(-0.06, 0.06, (count, 2))
     found[:, 2] = lowest
-    foot = scene.index("human", "right_foot")
-    met = np.clip(begin + random.integers(2, steps, count), 0, len(reference.states) - 1)
+    met = random.integers(2, steps, count)
     crossing = kind > 0.35
-    place = reference.states[met, foot, :3] + 0.08 * random.standard_normal((count, 3)) + (0.08, 0.0, 0.0)
+    place = np.array(paths[np.arange(count), met] + 0.08 * random.standard_normal((count, 3)) + (0.08, 0.0, 0.0))
     place[:, 2] = np.where(random.random(count) < 0.6, lowest, np.maximum(place[:, 2], lowest))
     found[crossing, :3] = place[crossing]
     rolling = kind > 0.6
-    motion = random.standard_normal((count, 3)) * (2.0, 2.0, 1.0)
+    motion = np.array((2.0, 2.0, 1.0)) * random.standard_normal((count, 3))
     found[rolling, 7:10] = motion[rolling]
-    away = ((met - begin) * scene.dt * random.uniform(0.0, 1.0, count))[:, None] * motion * (1.0, 1.0, 0.0)
+    away = (met * dt * random.uniform(0.0, 1.0, count))[:, None] * motion * (1.0, 1.0, 0.0)
     found[rolling, :3] -= away[rolling]
     flying = kind > 0.85
     found[flying, 2] += random.uniform(0.0, 1.0, count)[flying]
@@ -121,14 +133,13 @@ def random_places(
     return found
 
 
-def resting(link: Link, states: np.ndarray, sizes: np.ndarray | None = None) -> np.ndarray:
-    """Height (N,) [m] at which a link in states (N, 13) touches the ground, turned as it is.
-
-    sizes: (N, 3) length, radius and mass; the link's by default.
-    """
-    turned = Rotation.from_quat(states[:, packed.ORIENTATION], scalar_first=True)
-    length, radius = (link.length, link.radius) if sizes is None else (sizes[:, 0], sizes[:, 1])
-    return radius + 0.5 * length * np.abs(turned.apply(link.axis)[:, 2])
+def out_of_legs(scene: Scene, states: np.ndarray, morphology: np.ndarray | None = None) -> np.ndarray:
+    """The states (N, L, 13), but what is inside a leg, no initial state, waits out of reach instead."""
+    states, struck = states.copy(), scene.index(scene.pairs[0].second, scene.pairs[0].second_links[0])
+    inside = overlaps(scene, states, morphology)
+    states[inside, struck, :2] = (3.0, 0.0)
+    states[inside, struck, 2] = resting(scene.links[struck], states[inside, struck])
+    return states
 
 
 def overlaps(scene: Scene, states: np.ndarray, morphology: np.ndarray | None = None) -> np.ndarray:
@@ -142,7 +153,8 @@ def overlaps(scene: Scene, states: np.ndarray, morphology: np.ndarray | None = N
     return np.asarray(jnp.concatenate(gaps, axis=1).min(axis=1) < 0.0)
 
 
-def _turn(states: np.ndarray, angle: np.ndarray) -> np.ndarray:
+def turned_about_z(states: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """The states (N, L, 13) turned about the z axis by angles (N,) [rad]."""
     turn = Rotation.from_rotvec(np.repeat(angle, states.shape[1])[:, None] * (0.0, 0.0, 1.0))
     shape = (*states.shape[:2], 3)
     turned = states.copy()
@@ -154,25 +166,32 @@ def _turn(states: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 
 def random_episodes(
-    scene: Scene, reference: Reference, count: int, seed: int, steps: int = STEPS
+    scene: Scene, reference: Reference, count: int, seed: int, steps: int = STEPS, varied: bool = False
 ) -> tuple[Episodes, int]:
     """Episodes from `random_starts` under the reference's targets plus smooth noise; some with pushes from outside.
 
-    Returns them and how many diverged and were dropped.
+    varied: every human is another one. Returns them and how many diverged and were dropped.
     """
     random = np.random.default_rng(seed)
-    states, begin = random_starts(random, scene, reference, count, steps)
+    sizes = random_people(np.random.default_rng((seed, 1)), scene, count) if varied else None
+    states, begin = random_starts(random, scene, reference, count, steps, sizes)
     rows = np.minimum(begin[:, None] + np.arange(steps), len(reference.controls) - 1)
     size = random.uniform(0.0, 1.2, (count, 1, 1, 1))
     controls = reference.controls[rows] + size * smooth_noise(random, count, steps, 8, stray(scene))
     lower = np.array([motor.lower for motor in scene.motors])
     upper = np.array([motor.upper for motor in scene.motors])
     controls = np.clip(controls, lower, upper)
+    torques = pushes(random, scene, count, steps)
+    return record(Truth(scene, batch=min(count, 256)), states, controls, torques, sizes)
+
+
+def pushes(random: np.random.Generator, scene: Scene, count: int, steps: int) -> np.ndarray:
+    """Torques (count, steps, L, 3) [N m] on the human's links in the first steps of every tenth episode or so."""
     torques = np.zeros((count, steps, len(scene.links), 3))
     pushed = np.flatnonzero(random.random(count) < 0.1)
     human = scene.rows("human")
     torques[pushed, :10, human] = 4.0 * random.standard_normal((len(pushed), 1, human.stop - human.start, 3))
-    return record(Truth(scene, batch=min(count, 256)), states, controls, torques)
+    return torques
 
 
 def contact_episodes(
@@ -186,7 +205,7 @@ def contact_episodes(
     contacts = first_contacts(scene, source)
     rows = random.choice(np.flatnonzero((contacts >= 0) & (contacts + steps <= source.steps)), count)
     begin = np.maximum(contacts[rows] - random.integers(0, 4, count), 0)
-    states = source.states[rows, begin].astype(float)
+    states, sizes = source.states[rows, begin].astype(float), source.morphology[rows]
     columns = begin[:, None] + np.arange(steps)
     human, pair = scene.rows("human"), scene.pairs[0]
     struck = scene.index(pair.second, pair.second_links[0])
@@ -201,8 +220,11 @@ def contact_episodes(
         random, count, steps, 4, stray(scene)
     )
     torques = source.torques[rows[:, None], columns]
-    apart = ~overlaps(scene, states)
-    return record(Truth(scene, batch=256), states[apart], controls[apart], torques[apart])
+    apart = ~overlaps(scene, states, sizes)
+    varied = not np.allclose(sizes, scene.morphology)
+    return record(
+        Truth(scene, batch=256), states[apart], controls[apart], torques[apart], sizes[apart] if varied else None
+    )
 
 
 def random_roll(random: np.random.Generator, fastest: float) -> np.ndarray:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from larp_model import bodies
 from larp_model import state as packed
 from larp_model.bodies import standing_height
-from larp_model.scene import Scene
+from larp_model.scene import Body, Link, Scene
 from larp_model.truth.mujoco import Truth, closed, finite
 from tasks import bvh, key_poses
 from tasks.key_poses import KeyPoses
@@ -45,10 +45,12 @@ class Reference:
         return self.states[rows + 1], self.controls[rows]
 
 
-def standing_on_ground(scene: Scene, targets: np.ndarray, root: Rotation) -> np.ndarray:
+def standing_on_ground(
+    scene: Scene, targets: np.ndarray, root: Rotation, morphology: np.ndarray | None = None
+) -> np.ndarray:
     """States (N, L, 13) at rest, the human in the poses of joint targets (N, J, 3) [rad], standing on the ground.
 
-    root: N orientations of the pelvis, which is above the origin.
+    root: N orientations of the pelvis, which is above the origin. morphology: (N, L, 3); the scene's by default.
     """
     human, count = scene.bodies[0], len(targets)
     states = np.zeros((count, len(scene.links), packed.SIZE))
@@ -60,17 +62,30 @@ def standing_on_ground(scene: Scene, targets: np.ndarray, root: Rotation) -> np.
         rotations.append(rotations[joint.parent] * Rotation.from_rotvec(turn))
     for row, rotation in enumerate(rotations):
         states[:, row, packed.ORIENTATION] = rotation.as_quat(scalar_first=True)
-    stood = closed(scene.only(human.name), states[:, : len(human.links)])
-    lowest = np.min(
-        [
-            stood[:, row, 2] - abs(0.5 * link.length * rotations[row].apply(link.axis)[:, 2]) - link.radius
-            for row, link in enumerate(human.links)
-        ],
-        axis=0,
-    )
-    stood[..., 2] -= lowest[:, None]
+    given = human.sizes if morphology is None else morphology[:, : len(human.links)]
+    sizes = np.broadcast_to(given, (count, len(human.links), 3))
+    stood = closed(scene.only(human.name), states[:, : len(human.links)], sizes)
+    stood[..., 2] -= clearance(human, stood, sizes)[:, None]
     states[:, : len(human.links)] = stood
     return states
+
+
+def clearance(body: Body, states: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """How high (N,) [m] the lowest link of a body in states (N, n, 13), of sizes (N, n, 3), is above the ground."""
+    return np.min(
+        [states[:, row, 2] - resting(link, states[:, row], sizes[:, row]) for row, link in enumerate(body.links)],
+        axis=0,
+    )
+
+
+def resting(link: Link, states: np.ndarray, sizes: np.ndarray | None = None) -> np.ndarray:
+    """Height (N,) [m] at which a link in states (N, 13) touches the ground, turned as it is.
+
+    sizes: (N, 3) length, radius and mass; the link's by default.
+    """
+    turned = Rotation.from_quat(states[:, packed.ORIENTATION], scalar_first=True)
+    length, radius = (link.length, link.radius) if sizes is None else (sizes[:, 0], sizes[:, 1])
+    return radius + 0.5 * length * np.abs(turned.apply(link.axis)[:, 2])
 
 
 def starts(scene: Scene, poses: Sequence[KeyPoses]) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from larp_model.scene import Scene
 from larp_model.truth.episodes import Episodes
 from tasks import references
 from tasks.data import WINDOWS, random_episodes
+from tasks.motions.generator import any_episodes
 from tasks.thrown import thrown_episodes
 
 CHAIN_WINDOWS = (10, 40, 80, 190)
@@ -35,8 +36,12 @@ class Scenario:
     paper: tuple[tuple[str, tuple[float, ...]], ...] = ()
 
 
-def _around_the_kick(scene: Scene, count: int, seed: int) -> tuple[Episodes, int]:
-    return random_episodes(scene, references.embedded(human_and_ball()), count, seed)
+def _around_the_kick(scene: Scene, count: int, seed: int, varied: bool = False) -> tuple[Episodes, int]:
+    return random_episodes(scene, references.embedded(human_and_ball()), count, seed, varied=varied)
+
+
+def _any_human(scene: Scene, count: int, seed: int) -> tuple[Episodes, int]:
+    return any_episodes(scene, references.embedded(human_and_ball()), count, seed)
 
 
 def _human(name: str, scene: Scene, *paper: tuple[str, tuple[float, ...]]) -> Scenario:
@@ -57,12 +62,26 @@ SCENARIOS = {
             "human_capsule", human_and_capsule(), ("human", (0.010, 0.031, 0.050)), ("capsule", (0.010, 0.042, 0.069))
         ),
         _human("human", human_and_ball().only("human")),
+        Scenario("any_human", human_and_ball(), partial(_any_human, human_and_ball()), WINDOWS, strikes=True),
         _thrown("chain4", Scene((chain(links=4),))),
         _thrown("chains1", two_chains(1), 0.008, 0.021, 0.048, 0.173),
         _thrown("chains2", two_chains(2), 0.007, 0.023, 0.047, 0.137),
         _thrown("two_balls", two_balls(), varied=False),
     )
 }
+
+
+def around(chosen: Scenario, reference: Path | None, varied: bool) -> Scenario:
+    """The scenario around another kick, a captured one (see `references.captured`), or with other bodies, or both."""
+    if reference is None and not varied:
+        return chosen
+    if not any(body.kind == "human" for body in chosen.scene.bodies):
+        asked = "reference" if reference else "bodies varied"
+        raise ValueError(f"{asked} is asked for, but the scene {chosen.name} has no human")
+    if reference is None:
+        return replace(chosen, draw=partial(_around_the_kick, chosen.scene, varied=True), paper=())
+    kick = references.captured(reference, human_and_ball())
+    return replace(chosen, draw=partial(random_episodes, chosen.scene, kick, varied=varied), paper=())
 
 
 def trained_at(name: str, design: DesignName | None = None) -> Path:

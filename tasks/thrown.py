@@ -9,7 +9,8 @@ from larp_model import state as packed
 from larp_model.scene import Scene
 from larp_model.truth.episodes import Episodes, record
 from larp_model.truth.mujoco import Truth, closed
-from tasks.data import overlaps, resting
+from tasks.data import overlaps
+from tasks.references import clearance
 
 STEPS = 200
 # Bodies meet so long after the start [s], so high above the ground [m], so far off each other's middle [m].
@@ -57,11 +58,8 @@ def thrown_starts(random: np.random.Generator, scene: Scene, morphology: np.ndar
     # A body that starts in the ground is lifted out of it.
     for body in scene.bodies:
         rows = scene.rows(body.name)
-        above = [
-            states[:, row, 2] - resting(scene.links[row], states[:, row], morphology[:, row])
-            for row in range(rows.start, rows.stop)
-        ]
-        states[:, rows, 2] -= np.minimum(np.min(above, axis=0), 0.0)[:, None]
+        lowest = clearance(body, states[:, rows], morphology[:, rows])
+        states[:, rows, 2] -= np.minimum(lowest, 0.0)[:, None]
     return states
 
 

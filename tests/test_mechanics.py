@@ -288,3 +288,18 @@ def test_an_end_that_just_touches_the_ground_throws_no_body_however_that_is_roun
         given = shifted, np.zeros((len(shifted), 0, 3)), np.zeros((len(shifted), 4, 3))
         after = jax.jit(partial(motion_of, body))(*(jnp.asarray(each, jnp.float32) for each in given))
     assert (np.linalg.norm(after.velocity - shifted[..., packed.VELOCITY], axis=-1) < 5.0).all()
+
+
+def test_motors_of_other_sizes_pull_as_those_of_a_body_of_that_size() -> None:
+    sizes = human(height=1.6, mass=50.0, lengths={"thigh": 1.1}).sizes
+    body, other = human(), human().sized(sizes)
+    assert other.motors[0][2].stiffness < 0.8 * body.motors[0][2].stiffness
+    bent = standing_on_ground(Scene((other,)), 0.2 * np.ones((1, 12, 3)), Rotation.identity(1))
+    states, push = jnp.asarray(bent), jnp.ones((1, 13, 6))
+    given = jnp.zeros((1, 12, 3)), jnp.zeros((1, 13, 3)), jnp.asarray(sizes)[None], 9.81, 0.01
+    for one, two in (
+        (free_motion(body, states, *given), free_motion(other, states, *given)),
+        (impulse_response(body, states, push, given[2]), impulse_response(other, states, push, given[2])),
+    ):
+        for a, b in zip(one, two, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)

@@ -21,7 +21,8 @@ from larp_model.truth.episodes import Episodes
 from tasks import train
 from tasks.benchmarks import model
 from tasks.data import overlaps, resting
-from tasks.scenarios import SCENARIOS, scenario
+from tasks.references import clearance
+from tasks.scenarios import SCENARIOS, around, scenario
 
 COUNT = 32
 
@@ -127,3 +128,19 @@ def test_a_scene_becomes_weights_and_scores(
     assert found["launch"] == {}
     assert found["us_per_step"]["2"] > 0.0
     assert (tmp_path / "model.png").stat().st_size > 1000
+
+
+def test_other_bodies_than_a_human_are_not_asked_for_another_kick(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="reference is asked for, but the scene chains1 has no human"):
+        model.main(scene="chains1", reference=Path("kick.bvh"), json=tmp_path / "model.json")
+    with pytest.raises(ValueError, match="bodies varied is asked for, but the scene two_balls has no human"):
+        model.main(scene="two_balls", bodies="varied", json=tmp_path / "model.json")
+
+
+def test_varied_humans_around_the_kick_are_all_others_and_as_high_above_the_ground() -> None:
+    chosen = around(scenario("human_ball"), None, varied=True)
+    episodes, _ = chosen.draw(12, 3)
+    rows = chosen.scene.rows("human")
+    assert len(np.unique(episodes.morphology[:, rows, 2].sum(axis=1))) == len(episodes.states)
+    above = clearance(chosen.scene.body("human"), episodes.states[:, 0, rows], episodes.morphology[:, rows])
+    assert (np.abs(above) < 0.1).all()

@@ -10,7 +10,7 @@ from jax import Array
 
 from larp_model import contact, mechanics, rotation
 from larp_model import state as packed
-from larp_model.kinematics import Kinematics, apply, ends_on_ground
+from larp_model.kinematics import Kinematics, apply, ends_on_ground, strength
 from larp_model.meeting import Velocities
 from larp_model.networks import side_by_side
 from larp_model.parts.articulated import Known, changes_of
@@ -104,8 +104,11 @@ def servo_torques(body: Body, seen: Kinematics, control: Array) -> Array:
     """
     children = np.array([child for child, _, _ in body.motors])
     parents = np.array([joint.parent for _, joint, _ in body.motors])
-    stiffness = np.array([motor.stiffness for _, _, motor in body.motors], np.float32)[:, None]
-    limit = np.array([motor.torque_limit for _, _, motor in body.motors], np.float32)[:, None]
+    stronger = strength(body, seen.morphology)[:, None, None]
+    stiffness, limit = (
+        stronger * np.array([getattr(motor, name) for _, _, motor in body.motors], np.float32)[:, None]
+        for name in ("stiffness", "torque_limit")
+    )
     turned = packed.orientation(seen.state)
     relative = rotation.multiply(rotation.conjugate(turned[:, parents]), turned[:, children])
     pull = jnp.clip(stiffness * (control - rotation.to_rotation_vector(relative)), -limit, limit)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ from larp_model.truth.bullet import BulletTruth
 from larp_model.truth.episodes import Episodes
 from tasks.benchmarks import report
 from tasks.kick import WEIGHTS, remember_compilations, run
-from tasks.scenarios import Scenario, scenario, trained_at
+from tasks.scenarios import Scenario, around, scenario, trained_at
 
 # A step is timed with so many scenes side by side, over so many steps.
 BATCHES, TIMED = (1, 64, 512), 40
@@ -66,6 +66,8 @@ def main(
     json: Path | None = None,
     weights: Path | None = None,
     states: Path | None = None,
+    reference: Path | None = None,
+    bodies: Literal["usual", "varied"] = "usual",
     beside: DesignName | None = None,
     bullet: bool = False,
     publish: bool = False,
@@ -79,15 +81,19 @@ def main(
         json: where the figures go; the picture goes beside them.
         weights: manifest of the weights; the shipped ones by default.
         states: truth episodes (.npz) to evaluate on instead.
+        reference: a captured kick (BVH) to draw the episodes around.
+        bodies: varied draws another human for every episode.
         beside: weights of this design, from where `tasks.train --design` leaves them, on the same episodes.
         bullet: also how far Bullet, the second truth, strays from the first.
         publish: put the table into RESULTS.md.
     """
-    chosen = scenario(scene)
+    chosen = around(scenario(scene), reference, bodies == "varied")
     if sequences < 1:
         raise ValueError(f"sequences is {sequences}, but must be at least 1")
     manifest = weights_of(scene, weights)
-    json = json or Path(f"runs/benchmarks/model_{scene}.json")
+    what = [scene, *([reference.stem] if reference else []), *(["bodies varied"] if bodies == "varied" else [])]
+    name = "_".join(["model", *what]).replace(" ", "_")
+    json = json or Path(f"runs/benchmarks/{name}.json")
     report.ready(json, publish)
     remember_compilations()
     other = trained_at(scene, beside) / "weights" / f"{scene}.json"
@@ -98,6 +104,12 @@ def main(
     episodes = chosen.draw(sequences, seed)[0] if states is None else truth_episodes.load(states, chosen.scene)
     found = judged(manifest, chosen, episodes)
     source = f"--states {states.name}" if states else f"--sequences {sequences} --seed {seed}"
+    if weights:
+        source = f"--weights {weights.name} {source}"
+    if reference:
+        source += f" --reference {reference.name}"
+    if bodies == "varied":
+        source += " --bodies varied"
     if beside:
         source += f" --beside {beside}"
         found["beside"] = {"design": beside, **judged(other, chosen, episodes)}
@@ -106,12 +118,12 @@ def main(
         found["bullet"] = second_opinion(chosen.scene, episodes, chosen.windows)
     command = f"python -m tasks.benchmarks.model --scene {scene} {source}"
     report.write_json(json, {"command": command, "hardware": report.hardware(), **found})
-    title = f"{scene}: {len(episodes.states)} sequences"
+    title = f"{', '.join(what)}: {len(episodes.states)} sequences"
     report.write_picture(json.with_suffix(".png"), picture(found["windows"], chosen, title))
     table = table_of(found, chosen)
     report.show(table)
     if publish:
-        report.publish(f"model_{scene}", f"Model: {scene}", command, table)
+        report.publish(name, f"Model: {', '.join(what)}", command, table)
 
 
 def judged(manifest: Path, chosen: Scenario, episodes: Episodes) -> dict[str, Any]:
