@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from larp_model import kinematics, rotation
 from larp_model import state as packed
+from larp_model.networks import Weights
+from larp_model.parts.part import Model
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from larp_model.training import Trajectories, first_contacts
@@ -27,13 +31,18 @@ def predict(
     chunk: int = 128,
 ) -> np.ndarray:  # fmt: skip
     """States (E, H, L, 13) that the simulator predicts from states (E, L, 13), chunk by chunk."""
-    roll = jax.jit(simulator.rollout)
     parts = []
     for begin in range(0, len(states), chunk):
         rows = np.minimum(np.arange(begin, begin + chunk), len(states) - 1)
         start, targets, pushes, sizes = (jnp.asarray(each[rows]) for each in (states, controls, torques, morphology))
-        parts.append(np.asarray(roll(start, targets, torques=pushes, morphology=sizes)))
+        parts.append(np.asarray(_roll(simulator.model, simulator.weights, start, targets, pushes, sizes)))
     return np.concatenate(parts)[: len(states)]
+
+
+@partial(jax.jit, static_argnums=0)
+def _roll(model: Model, weights: Weights, start: Array, targets: Array, pushes: Array, sizes: Array) -> Array:
+    """Compiled once for all weights of a model."""
+    return Simulator(model, weights).rollout(start, targets, torques=pushes, morphology=sizes)
 
 
 def evaluate(simulator: Simulator, episodes: Trajectories, windows: Sequence[int]) -> dict[str, Any]:

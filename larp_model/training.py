@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -24,6 +25,9 @@ from larp_model.networks import Weights
 from larp_model.parts.part import Model, initial_weights, measure
 from larp_model.scene import Scene
 from larp_model.simulator import rollout
+
+# Updates by which it is judged how many fit into a time.
+TIMED = 20
 
 
 class Trajectories(Protocol):
@@ -163,12 +167,17 @@ def emphasis(scene: Scene, recipe: Recipe) -> Array:
 
 
 def optimiser(recipe: Recipe) -> optax.GradientTransformation:
-    """Adam behind a clipped gradient norm, its rate on a cosine."""
+    """Adam behind a clipped gradient norm; its changes are still to be multiplied by a rate."""
+    return optax.chain(optax.clip_by_global_norm(recipe.clip), optax.scale_by_adam())
+
+
+def learning_rate(recipe: Recipe, update: int) -> float:
+    """Of an update: rises for a while, then falls on a cosine."""
     warm = min(500, recipe.updates // 10 + 1)
-    schedule = optax.warmup_cosine_decay_schedule(
-        0.0, recipe.learning_rate, warm, max(recipe.updates, warm + 1), recipe.learning_rate * recipe.final
-    )
-    return optax.chain(optax.clip_by_global_norm(recipe.clip), optax.adam(schedule))
+    if update < warm:
+        return recipe.learning_rate * update / warm
+    done = min(1.0, (update - warm) / max(recipe.updates - warm, 1))
+    return recipe.learning_rate * (recipe.final + (1.0 - recipe.final) * 0.5 * (1.0 + math.cos(math.pi * done)))
 
 
 def train(
@@ -178,11 +187,13 @@ def train(
     folder: Path,
     start: Weights | None = None,
     quiet: bool = False,
+    seconds: float = math.inf,
 ) -> tuple[Weights, dict[str, Any]]:
     """Train on sources of (trajectories, share); returns the weights and a log of loss, norms and drops.
 
     folder: where checkpoints are kept; a run cut off there goes on from its last. start: weights to go on from instead
-    of fresh ones. Where a hundred batches in a row are dropped, the last good weights are returned and the log says so.
+    of fresh ones. seconds: only as many of the updates as fit into them, judged by the first. Where a hundred batches
+    in a row are dropped, the last good weights are returned and the log says so.
     """
     random = np.random.default_rng(recipe.seed)
     scene, windows = model.scene, Windows(model.scene, sources, recipe)
@@ -209,7 +220,7 @@ def train(
 
     @partial(jax.jit, donate_argnums=(0, 1))
     def update(
-        networks: dict[str, Any], state: Any, key: Array, drawn: Any
+        networks: dict[str, Any], state: Any, key: Array, drawn: Any, rate: float | Array
     ) -> tuple[dict[str, Any], Any, dict[str, Array]]:
         states = drawn.states
         if not model.invariant:
@@ -221,6 +232,7 @@ def train(
         good = jnp.isfinite(norm) & (norm < recipe.drop)
         gradient = jax.tree.map(lambda g: jnp.where(good, g, 0.0), gradient)
         changes, new_state = transform.update(gradient, state, networks)
+        changes = jax.tree.map(lambda change: -rate * change, changes)
         keep = partial(jax.tree.map, lambda new, old: jnp.where(good, new, old))
         return (
             keep(optax.apply_updates(networks, changes), networks),
@@ -238,10 +250,11 @@ def train(
     )  # fmt: skip
     with Progress(*columns, disable=quiet) as bar:
         task = bar.add_task("", total=recipe.updates, completed=first, note="")
-        for index in range(first, recipe.updates):
+        index = first
+        while index < recipe.updates:
             drawn = windows.draw(np.random.default_rng((recipe.seed, index)), recipe.unroll(index))
             key = jax.random.fold_in(jax.random.key(recipe.seed), index)
-            networks, state, terms = update(networks, state, key, drawn)
+            networks, state, terms = update(networks, state, key, drawn, learning_rate(recipe, index))
             values = {name: float(value) for name, value in terms.items()}
             recent.append(values)
             log["dropped"] += int(values["dropped"])
@@ -266,6 +279,14 @@ def train(
             if in_a_row >= 100:
                 log["stopped_early"] = True
                 break
+            index += 1
+            if index == first + 1:
+                compiled = time.perf_counter()
+            elif index == first + TIMED and math.isfinite(seconds):
+                now = time.perf_counter()
+                left = (seconds - (now - begin)) / ((now - compiled) / (TIMED - 1))
+                recipe = replace(recipe, updates=min(recipe.updates, index + max(1, int(left))))
+                bar.update(task, total=recipe.updates)
     manager.wait_until_finished()
     manager.close()
     log["seconds"] = time.perf_counter() - begin

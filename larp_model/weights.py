@@ -170,10 +170,7 @@ def load(manifest: Path, scene: Scene) -> tuple[Model, Weights, dict[str, Any]]:
         version, expected = content["version"], content["sha256"]
         known = version == VERSION
         parts = [decode(part) for part in content["parts"]] if known else []
-        trained = {
-            kind: Trained(*(np.array(sizes[name], float).reshape(-1, 3) for name in Trained._fields))
-            for kind, sizes in (content["trained on"] if known else {}).items()
-        }
+        trained = trained_sizes(content) if known else {}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"weights manifest {manifest} cannot be read: {type(error).__name__}: {error}") from None
     if not known:
@@ -215,17 +212,31 @@ def differences(part: BodyPart | PairPart, scene: Scene, trained: Mapping[str, T
 def _bodies_differ(body: Body, own: Body, trained: Trained) -> Iterator[str]:
     """Links' sizes may be any between those trained on."""
     yield from _differ(f"{body.name}.links", len(body.links), len(own.links))
-    for link, was, lowest, highest in zip(body.links, own.links, *trained, strict=True):
+    for link, was in zip(body.links, own.links, strict=True):
         yield from _differ(f"{body.name}.{link.name}.axis", link.axis, was.axis)
         yield from _differ(f"the name of {body.name}.{link.name}", link.name, was.name)
+    yield from beyond(body, trained)
+    for joint, before, link in zip(body.joints, own.sized(body.sizes).joints, body.links[1:], strict=True):
+        yield from _differ(f"the joint of {body.name}.{link.name}", joint, before)
+    yield from _differ(f"{body.name}.surface", body.surface, own.surface)
+
+
+def beyond(body: Body, trained: Trained) -> Iterator[str]:
+    """Which sizes of a body's links are none that its part has learned from, each in a few words."""
+    for link, lowest, highest in zip(body.links, *trained, strict=True):
         for name, low, high in zip(("length", "radius", "mass"), lowest, highest, strict=True):
             value = getattr(link, name)
             if not low * (1.0 - 1e-5) - 1e-6 <= value <= high * (1.0 + 1e-5) + 1e-6:
                 span = f"{low:.6g}" if low == high else f"{low:.6g} to {high:.6g}"
                 yield f"{body.name}.{link.name}.{name} is {value:.6g}, but they were trained on {span}"
-    for joint, before, link in zip(body.joints, own.sized(body.sizes).joints, body.links[1:], strict=True):
-        yield from _differ(f"the joint of {body.name}.{link.name}", joint, before)
-    yield from _differ(f"{body.name}.surface", body.surface, own.surface)
+
+
+def trained_sizes(content: Mapping[str, Any]) -> dict[str, Trained]:
+    """The sizes that a manifest's weights were trained on, by kind of body."""
+    return {
+        kind: Trained(*(np.array(sizes[name], float).reshape(-1, 3) for name in Trained._fields))
+        for kind, sizes in content["trained on"].items()
+    }
 
 
 def _differ(what: str, now: Any, was: Any) -> Iterator[str]:

@@ -406,12 +406,15 @@ def table(summary: dict[str, Any]) -> Table:
     return rows
 
 
-def prepare(body_reference: Path | None = None, height: float = HEIGHT, substeps: int = FINE_SUBSTEPS) -> Kick:
+def prepare(
+    body_reference: Path | None = None, height: float = HEIGHT, substeps: int = FINE_SUBSTEPS, mass: float | None = None
+) -> Kick:
     """The kick's scene with its reference: the embedded one, or a captured one from a BVH file.
 
-    height: of the human [m]. substeps: engine steps of the truth in a step.
+    height: of the human [m]. substeps: engine steps of the truth in a step. mass: of the human [kg]; as heavy as its
+    height squared by default.
     """
-    scene = human_and_ball(height=height, mass=MASS * (height / HEIGHT) ** 2)
+    scene = human_and_ball(height=height, mass=MASS * (height / HEIGHT) ** 2 if mass is None else mass)
     reference = references.embedded(scene) if body_reference is None else references.captured(body_reference, scene)
     return Kick(scene, reference, substeps)
 

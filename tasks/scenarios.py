@@ -17,6 +17,8 @@ from tasks.motions.generator import any_episodes
 from tasks.thrown import thrown_episodes
 
 CHAIN_WINDOWS = (10, 40, 80, 190)
+# The scenario, and the weights, of humans of every size in any motion.
+ANY_HUMAN = "any_human"
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ SCENARIOS = {
             "human_capsule", human_and_capsule(), ("human", (0.010, 0.031, 0.050)), ("capsule", (0.010, 0.042, 0.069))
         ),
         _human("human", human_and_ball().only("human")),
-        Scenario("any_human", human_and_ball(), partial(_any_human, human_and_ball()), WINDOWS, strikes=True),
+        Scenario(ANY_HUMAN, human_and_ball(), partial(_any_human, human_and_ball()), WINDOWS, strikes=True),
         _thrown("chain4", Scene((chain(links=4),))),
         _thrown("chains1", two_chains(1), 0.008, 0.021, 0.048, 0.173),
         _thrown("chains2", two_chains(2), 0.007, 0.023, 0.047, 0.137),

@@ -83,6 +83,7 @@ ORDER = [
     "tasks.kick_straight",
     "tasks.kick_right",
     "tasks.train",
+    "tasks.adapt",
     "tasks.benchmarks.report",
     "tasks.benchmarks.kick",
     "tasks.benchmarks.gap",

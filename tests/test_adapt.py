@@ -1,0 +1,94 @@
+"""Fitting weights to a motion and a body: what is promised of time, of the better of both, and of bad input."""
+
+import json
+import math
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from larp_model import designs, training
+from larp_model import weights as stored
+from larp_model.bodies import human_and_ball
+from tasks import adapt
+from tasks.adapt import Checked
+from tasks.data import random_episodes
+from tasks.kick import prepare
+from tasks.scenarios import ANY_HUMAN
+from tasks.train import OVER_MECHANICS
+
+SCENE = human_and_ball()
+
+
+@pytest.fixture(scope="module")
+def manifest(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights of the least networks, hardly trained."""
+    folder = tmp_path_factory.mktemp("weights")
+    model = designs.compact(SCENE, designs.TINY)  # compiles sooner than one over mechanics
+    episodes, _ = random_episodes(SCENE, prepare().reference, 64, 3)
+    windows = training.Windows(SCENE, [(episodes, 1.0)], OVER_MECHANICS)
+    weights = training.statistics_of(model, windows, np.random.default_rng(0), batches=1)
+    return stored.save(folder, ANY_HUMAN, model, weights, {})
+
+
+def test_smaller_errors_are_better_and_the_same_are_not() -> None:
+    usual = Checked((0.01, 0.04, 0.08), 0.08)
+    assert Checked((0.006, 0.03, 0.05), 0.05).better_than(usual)
+    assert Checked((0.006, 0.03, 0.05), math.nan).better_than(usual._replace(launch=math.nan))
+    assert not usual.better_than(usual)
+    assert not Checked((math.inf,) * 3, 0.05).better_than(usual)
+
+
+@pytest.mark.parametrize(
+    ("given", "complaint"),
+    [
+        ({"minutes": 0.5}, "minutes is 0.5, but must be at least 2"),
+        ({"minutes": math.nan}, "minutes is nan, but must be at least 2"),
+        ({"reference": Path("nowhere.bvh")}, "reference is 'nowhere.bvh', but no such file exists"),
+        ({"height": -1.0}, "height is -1.0, but must be a positive finite number"),
+        ({"weights": Path("nowhere.json")}, "nowhere.json does not exist"),
+    ],
+)
+def test_bad_input_is_refused_before_anything_is_drawn(
+    given: dict[str, object], complaint: str, manifest: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        adapt.main(**({"weights": manifest, "out": tmp_path / "out"} | given))  # type: ignore[arg-type]
+    assert not list((tmp_path / "out").glob("*.json"))
+
+
+def test_adapting_keeps_its_time_says_that_it_extrapolates_and_writes_the_better_of_both(
+    manifest: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, value in (("LEAST", 0.0), ("HELD_OUT", 8), ("FEWEST", 24), ("MOST", 24), ("CHECKING", 5.0)):
+        monkeypatch.setattr(adapt, name, value)
+    begin = time.perf_counter()
+    adapt.main(height=1.6, mass=50.0, minutes=1.0, weights=manifest, out=tmp_path)
+    took = time.perf_counter() - begin
+    said = capsys.readouterr().out
+    content = json.loads((tmp_path / f"{ANY_HUMAN}.json").read_text())["recipe"]
+    assert "beyond what the weights know: human." in said and took < 120.0
+    before, after = (Checked(tuple(content[name]["human"]), content[name]["launch"]) for name in ("before", "after"))
+    assert content["kept"] == ("after" if after.better_than(before) else "before")
+    stored.load(tmp_path / f"{ANY_HUMAN}.json", human_and_ball(height=1.6, mass=50.0))
+    stored.load(tmp_path / f"{ANY_HUMAN}.json", SCENE)
+
+
+def test_training_for_a_time_takes_that_time(manifest: Path, tmp_path: Path) -> None:
+    model, weights, _ = stored.load(manifest, SCENE)
+    episodes, _ = random_episodes(SCENE, prepare().reference, 16, 4, steps=12)
+    recipe = training.Recipe(100_000, 16, ((1, 1.0),))
+    learned, log = training.train(model, recipe, [(episodes, 1.0)], tmp_path, weights, quiet=True, seconds=8.0)
+    assert log["seconds"] < 60.0 and training.TIMED < log["history"][-1]["update"] < 100_000
+    moved = jax.tree.map(lambda a, b: bool((a != b).any()), learned.networks, weights.networks)
+    assert any(jax.tree.leaves(moved))
+
+
+def test_the_learning_rate_rises_from_nothing_and_falls_to_its_last_share() -> None:
+    recipe = training.Recipe(updates=1000, learning_rate=2e-3, final=0.01)
+    rates = [training.learning_rate(recipe, update) for update in range(1001)]
+    assert rates[0] == 0.0 and max(rates) == pytest.approx(2e-3) and rates[1000] == pytest.approx(2e-5)
+    top = int(np.argmax(rates))
+    assert (np.diff(rates[: top + 1]) > 0.0).all() and (np.diff(rates[top:]) < 0.0).all()
