@@ -32,7 +32,7 @@ def step(
     """
     scene = model.scene
     torque = jnp.zeros((*state.shape[:-1], 3), state.dtype) if torque is None else torque
-    sizes = morphology_of(scene)[None] if morphology is None else morphology
+    sizes = morphology_of(scene)[None].astype(state.dtype) if morphology is None else morphology
     seen = model.each(kinematics(scene, state, sizes))
     moving = [
         part.move(weights, own, control[:, scene.motor_rows(part.body.name)], torque[:, scene.rows(part.body.name)])
