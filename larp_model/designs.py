@@ -31,9 +31,16 @@ class Sizes:
 
 
 COMPACT = Sizes(Size(6, 256), Size(2, 32), Size(4, 128))
-HYBRID = Sizes(Size(5, 128), Size(2, 32), Size(4, 128))
-TINY = Sizes(Size(2, 16), Size(2, 16), Size(2, 16))  # the least that have all parts
+LEAST = Sizes(Size(2, 16), Size(2, 16), Size(2, 16))  # that have all parts
 PAPER = Sizes(Size(12, 512, skip=False), Size(12, 128, skip=False), Size(6, 128, skip=False))
+
+SizeName = Literal["tiny", "small", "base"]
+# Of the hybrid design. Of what is measured in any human, it is launches that a larger network improves.
+SIZES: dict[SizeName, Sizes] = {
+    "tiny": Sizes(Size(3, 64), Size(2, 32), Size(3, 64)),
+    "small": Sizes(Size(5, 128), Size(2, 32), Size(4, 128)),
+    "base": Sizes(Size(5, 128), Size(2, 32), Size(6, 256)),
+}
 
 
 def compact(scene: Scene, sizes: Sizes = COMPACT) -> Model:
@@ -41,7 +48,7 @@ def compact(scene: Scene, sizes: Sizes = COMPACT) -> Model:
     return _impulsive(scene, sizes, FromNothing())
 
 
-def hybrid(scene: Scene, sizes: Sizes = HYBRID) -> Model:
+def hybrid(scene: Scene, sizes: Sizes = SIZES["small"]) -> Model:
     """The model over mechanics."""
     return _impulsive(scene, sizes, OverMechanics())
 

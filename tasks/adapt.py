@@ -28,7 +28,7 @@ from larp_model.weights import Trained
 from tasks.data import WINDOWS, contact_episodes, random_episodes
 from tasks.kick import HEIGHT, prepare, remember_compilations, run
 from tasks.scenarios import ANY_HUMAN
-from tasks.train import HUMAN, OVER_MECHANICS, STRIKING
+from tasks.train import HUMAN, IMPACTS, OVER_MECHANICS
 
 # Episodes that weights are checked on, the fewest to learn from, and shares of the time: truth; of what is then left,
 # the swing before the impact.
@@ -73,7 +73,7 @@ def trained_on(
 ) -> Weights:
     """Weights trained on for so many seconds: the human's swing on long episodes, then its impacts on both."""
     swing = replace(OVER_MECHANICS, learning_rate=RATE, updates=MOST, seed=seed, only=HUMAN)
-    impact = replace(STRIKING[-1].recipe, learning_rate=RATE, updates=MOST, seed=seed + 1)
+    impact = replace(IMPACTS, learning_rate=RATE, updates=MOST, seed=seed + 1)
     for name, recipe, sources, limit in (
         ("swing", swing, [long], seconds[0]),
         ("impact", impact, [long, short], seconds[1]),
@@ -155,7 +155,7 @@ def main(
         [np.concatenate([getattr(known[body.kind], end) for body in scene.bodies]) for end in Trained._fields]
     )
     written = stored.save(
-        out, ANY_HUMAN, model, learned if better else start, recipe, np.concatenate([sizes, scene.morphology[None]])
+        out, "adapted", model, learned if better else start, recipe, np.concatenate([sizes, scene.morphology[None]])
     )
     console.print(f"weights: {written}; {time.perf_counter() - begin:.0f} s in all")
 

@@ -55,6 +55,7 @@ from tasks.data import stray
 from tasks.gap import contact_step, gap, told
 from tasks.presets import Preset, preset_of, usable
 from tasks.references import Reference
+from tasks.scenarios import ANY_HUMAN
 from tasks.standing import Standing
 from viewer import LivePage, Recording, kick_picture, nearest_approach, write_html
 
@@ -291,30 +292,34 @@ def miss(path: np.ndarray, target: np.ndarray) -> float:
     return nearest_approach(path, target).distance
 
 
-def models_of(
-    scene: Scene, name: DynamicsName, weights: Path, trained_on: Scene | None = None, substeps: int = SUBSTEPS,
-    rows: int = ROWS,
-) -> Models:  # fmt: skip
+def shipped(scene: Scene, reference: Path | None) -> Path:
+    """The manifest of the shipped weights for a kick: of the embedded one, or of any human in any motion."""
+    embedded = reference is None and scene == human_and_ball()
+    return stored.SHIPPED / f"{WEIGHTS if embedded else ANY_HUMAN}.json"
+
+
+def models_of(scene: Scene, name: DynamicsName, weights: Path, substeps: int = SUBSTEPS, rows: int = ROWS) -> Models:
     """The planners' models; that of the scene goes on with the ball alone once no link can reach it any more.
 
-    trained_on: the scene of the weights, where that is another one. substeps: engine steps in a step of MuJoCo. rows:
-    candidates that it rolls out side by side.
+    After the kick the human moves as it must: whatever the weights, those shipped for any human predict it then.
+    substeps: engine steps in a step of MuJoCo. rows: candidates that it rolls out side by side.
     """
     human, ball = scene.bodies[0].name, scene.bodies[-1].name
 
-    def model(*bodies: str) -> Dynamics:
-        part = scene.only(*bodies)
-        return MujocoDynamics(Truth(part, rows, substeps)) if name == "mujoco" else Simulator(learned.on(part), tensors)
-
+    parts = [scene.only(*bodies) for bodies in ((human, ball), (ball,), (human,))]
+    models: list[Dynamics]
     if name == "larp":
-        learned, tensors, manifest = stored.load(weights, trained_on or scene)
+        learned, tensors, manifest = stored.load(weights, scene)
+        moving, motion, _ = stored.load(stored.SHIPPED / f"{ANY_HUMAN}.json", parts[2])
+        models = [*(Simulator(learned.on(part), tensors) for part in parts[:2]), Simulator(moving, motion)]
         used = manifest["sha256"][:12]
     elif name == "mujoco":
-        used = "none"
+        models, used = [MujocoDynamics(Truth(part, rows, substeps)) for part in parts], "none"
     else:
         raise ValueError(f"dynamics is {name!r}, but must be 'larp' or 'mujoco'")
+    whole, alone, after = models
     rest = slice(scene.rows(human).stop, None)
-    return Models(Continued(model(human, ball), model(ball), rest, FLIGHT), model(human), name == "larp", used)
+    return Models(Continued(whole, alone, rest, FLIGHT), after, name == "larp", used)
 
 
 def planners_of(kick: Kick, preset: Preset, models: Models) -> Planners:
@@ -424,7 +429,9 @@ def main(
     preset: str = "balanced",
     dynamics: str = "larp",
     reference: Path | None = None,
-    weights: Path = stored.SHIPPED / f"{WEIGHTS}.json",
+    weights: Path | None = None,
+    height: float = HEIGHT,
+    mass: float | None = None,
     seed: int = 0,
     out: Path = Path("runs/kick"),
     view: bool = False,
@@ -437,7 +444,9 @@ def main(
         preset: fast, balanced or accurate.
         dynamics: the planner's model: larp (learned) or mujoco.
         reference: a captured kick (BVH) instead of the embedded one.
-        weights: manifest of the weights of the learned model.
+        weights: manifest of the weights of the learned model; those shipped for the kick by default.
+        height: of the human [m].
+        mass: of the human [kg]; as heavy as its height squared by default.
         seed: of the planner's random numbers.
         out: folder for summary.json, kick.npz, kick.png and kick.html.
         view: show the kick live in the browser, on 127.0.0.1.
@@ -449,8 +458,8 @@ def main(
     chosen = preset_of(preset)
     require_writable(out, "out")
     remember_compilations()
-    kick = prepare(reference)
-    models = models_of(kick.scene, dynamics, weights)  # type: ignore[arg-type]
+    kick = prepare(reference, height, mass=mass)
+    models = models_of(kick.scene, dynamics, weights or shipped(kick.scene, reference))  # type: ignore[arg-type]
     planners = planners_of(kick, chosen, models)
     page = LivePage(port=port) if view else None
     if page:

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from larp_model.bodies import chain, human_and_ball, human_and_capsule, two_balls, two_chains
-from larp_model.designs import DesignName
+from larp_model.designs import DesignName, SizeName
 from larp_model.scene import Scene
 from larp_model.truth.episodes import Episodes
 from tasks import references
@@ -86,9 +86,9 @@ def around(chosen: Scenario, reference: Path | None, varied: bool) -> Scenario:
     return replace(chosen, draw=partial(random_episodes, chosen.scene, kick, varied=varied), paper=())
 
 
-def trained_at(name: str, design: DesignName | None = None) -> Path:
-    """Where a run trains a scene's weights, of its own design or of another."""
-    return Path("runs/train") / "_".join([name, *([design] if design else [])])
+def trained_at(name: str, design: DesignName | None = None, size: SizeName | None = None) -> Path:
+    """Where a run trains a scene's weights, of its own design and size or of others."""
+    return Path("runs/train") / "_".join([name, *(each for each in (design, size) if each)])
 
 
 def scenario(name: str) -> Scenario:

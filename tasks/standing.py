@@ -1,12 +1,16 @@
-"""Stay up after the kick: only the human is modelled, for no ball is in reach any more.
+"""Come to a stand from where the kick ends: only the human is modelled, for no ball is in reach any more.
 
-    minimise over theta   w_c mean_t |c(t) - c^ref(t)|^2            the capture point stays where the reference has it
-                        + w_r mean_t |x_i(t) - x_i^ref(t)|^2        links stay near the reference, root-aligned
+    minimise over theta   w_b mean_t s(t) |c(t) - m(t)|^2           the capture point comes to be between the feet
+                        + w_f mean_t s(t) sum_i max(0, h_i(t))^2    both feet come down
+                        + w_l mean_t sum_j |u_j(t)|^2               pelvis and torso stay upright
                         + w_u mean_t max(0, h - z_pelvis(t))^2      the pelvis stays up
-                        + w_e mean_t |Q(t) - Q^ref(t)|^2            joint targets stay near the reference's
+                        + w_e mean_t |Q(t) - Q^stance(t)|^2         joint targets stay near those of a stance
 
-c = x + v sqrt(z / g) of the centre of mass, seen from the standing foot, is the instantaneous capture point (J. Pratt
-et al., "Capture Point: A Step toward Humanoid Push Recovery", 2006): where a foot would have to be to come to rest.
+c = x + v sqrt(z / g) of the centre of mass is the instantaneous capture point (J. Pratt et al., "Capture Point: A Step
+toward Humanoid Push Recovery", 2006): where a foot would have to be to come to rest. m is the middle between the feet,
+h_i a foot's height above the ground, u_j what of a link's upward axis is horizontal. s rises from 0 to 1 while the kick
+swings out, and so do the targets, from the kick's last to the stance's. Where the human stands, and how wide, is left
+to the planner.
 """
 
 from __future__ import annotations
@@ -17,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from larp_model import rotation
 from larp_model import state as packed
 from larp_model.bodies import standing_height
 from larp_model.scene import Scene
@@ -30,51 +35,66 @@ from tasks.references import Reference
 HORIZON = 50
 KNOTS = 6
 SEARCH = 0.5
+# Steps from the strike until the kick has swung out, until it counts fully that the human stands, and until the joint
+# targets are the stance's.
+SWUNG, SETTLED, STANCE = 20, 50, 50
+# Joint targets that are not zero when one stands: links and angles about x and y [rad], of the left side.
+KNEES, ELBOWS = 0.5, 0.25
 
 
 class Standing:
-    """The standing task of a scene's human (its first body) along a reference: terms, windows and planner."""
+    """The standing task of a scene's human (its first body) after a reference's strike: terms, windows and planner."""
 
     def __init__(self, scene: Scene, reference: Reference) -> None:
         self.scene, self.reference = scene, reference
         human = scene.bodies[0]
         self.human = scene.rows(human.name)
-        self.foot = human.link("left_foot")
+        self.feet = np.array([human.link("left_foot"), human.link("right_foot")])
+        self.lying = np.array([human.links[foot].radius for foot in self.feet], np.float32)
         self.height = standing_height(human)
         mass = np.array([link.mass for link in human.links], np.float32)
         self.share = mass / mass.sum()
+        self.stance = stance(scene)
 
     def capture_point(self, states: Array) -> Array:
-        """The capture point (*, 2) [m] of the human's states (*, n, 13), from the standing foot's centre."""
+        """The capture point (*, 2) [m] of the human's states (*, n, 13), from the middle between its feet."""
         place = jnp.einsum("...lx,l->...x", packed.position(states), self.share)
         velocity = jnp.einsum("...lx,l->...x", packed.velocity(states), self.share)
         pace = jnp.sqrt(jnp.maximum(place[..., 2:], 0.1) / self.scene.gravity)
-        return (place + pace * velocity)[..., :2] - packed.position(states)[..., self.foot, :2]
+        return (place + pace * velocity)[..., :2] - jnp.mean(packed.position(states)[..., self.feet, :2], axis=-2)
 
     @property
     def terms(self) -> tuple[CostTerm, ...]:
         """The named costs of a candidate."""
 
         def balance(states: Array, controls: Array, context: Any) -> Array:
-            return self.capture_point(states) - context["capture_point"]
+            return context["settled"][:, None] * self.capture_point(states)
+
+        def feet(states: Array, controls: Array, context: Any) -> Array:
+            above = packed.position(states)[:, self.feet, 2] - self.lying
+            return context["settled"][:, None] * jnp.maximum(above, 0.0)
+
+        def lean(states: Array, controls: Array, context: Any) -> Array:
+            up = rotation.matrix(packed.orientation(states[:, :2]))[..., :2, 2]
+            return up.reshape(len(states), -1)
 
         return (
             CostTerm("balance", balance, quadratic, 100.0),
-            CostTerm("reference", residuals.pose, quadratic, 20.0),
+            CostTerm("feet", feet, quadratic, 50.0),
+            CostTerm("lean", lean, quadratic, 20.0),
             CostTerm("upright", residuals.upright, quadratic, 100.0),
             CostTerm("effort", residuals.effort, quadratic, 0.2),
         )
 
     def window(self, step: int) -> Window:
-        """The reference's window from a step on, as the residuals' context."""
-        states, controls = self.reference.window(step, HORIZON)
-        human = states[:, self.human]
-        links = human[..., packed.POSITION]
+        """The targets from a step on, and how much standing counts, as the residuals' context."""
+        ahead = step - self.reference.strike + np.arange(HORIZON)
+        share = smooth((ahead - 0.5 * SWUNG) / (STANCE - 0.5 * SWUNG))[:, None, None]
+        last = self.reference.window(self.reference.strike + SWUNG // 2, 1)[1]
+        controls = (1.0 - share) * last + share * self.stance
         context = {
-            "capture_point": np.asarray(self.capture_point(jnp.asarray(human))),
-            "reference": links - links[:, :1],
-            "counted": np.ones(HORIZON),
-            "height": 0.98 * human[:, 0, 2:3],
+            "settled": np.clip((ahead - SWUNG) / (SETTLED - SWUNG), 0.0, 1.0),
+            "height": np.full((HORIZON, 1), 0.95 * self.height),
             "controls": controls,
         }
         return Window(controls, context)
@@ -93,3 +113,21 @@ class Standing:
             bounds[:, 0],
             bounds[:, 1],
         )
+
+
+def smooth(share: np.ndarray) -> np.ndarray:
+    """From 0 to 1 without a corner, and held beyond."""
+    share = np.clip(share, 0.0, 1.0)
+    return share**2 * (3.0 - 2.0 * share)
+
+
+def stance(scene: Scene) -> np.ndarray:
+    """Joint targets (J, 3) [rad] of a human who stands with knees a little bent, feet flat below the hips."""
+    human = scene.bodies[0]
+    targets = np.zeros((len(human.motors), 3))
+    for row, (child, _, _) in enumerate(human.motors):
+        side, _, segment = human.links[child].name.partition("_")
+        pitch = {"thigh": -0.5, "shin": 1.0, "foot": -0.5}.get(segment, 0.0) * KNEES
+        roll = {"left": ELBOWS, "right": -ELBOWS}[side] if segment == "upper_arm" else 0.0
+        targets[row] = roll, pitch, 0.0
+    return targets

@@ -22,7 +22,7 @@ from rich.console import Console
 
 from larp_model import designs, evaluation, training
 from larp_model import weights as stored
-from larp_model.designs import DesignName
+from larp_model.designs import DesignName, SizeName
 from larp_model.losses import LossWeights
 from larp_model.networks import Weights
 from larp_model.scene import Scene
@@ -34,9 +34,11 @@ from mpc import CEM
 from tasks.data import contact_episodes, random_task
 from tasks.kick import WEIGHTS, Kick, models_of, planners_of, prepare, remember_compilations, run
 from tasks.presets import Preset
-from tasks.scenarios import scenario, trained_at
+from tasks.scenarios import ANY_HUMAN, Scenario, scenario, trained_at
 
 EVALUATION_SEED = 1
+# Short episodes of impacts for each long one.
+CONTACTS = 3
 # How the planner searches for the candidates that it is trained on: by sampling, for a step by gradients tries few.
 CANDIDATES = Preset((CEM(256, 10, 24, 1.0),), (CEM(128, 3, 24, 1.0),), every=4)
 # Errors of a velocity count linearly: the median launch matters, not the worst.
@@ -71,7 +73,9 @@ OVER_MECHANICS = replace(
     STEPS, updates=10000, contact_share=0.4, before_contact=5, loss=LOSS._replace(far=0.005, fast=0.02)
 )
 GENERAL = (Stage("steps", "", OVER_MECHANICS),)
-# What is struck there is a body like others, whose response counts like the push.
+# A struck ball is its launch, and nothing blurs that; what else is struck is a body like others, whose response counts
+# like the push.
+STRIKING_BALLS = (*GENERAL, Stage("impacts", "", IMPACTS))
 STRIKING = (*GENERAL, Stage("impacts", "", replace(IMPACTS, only=("contact", "response"), loss=LOSS)))
 # Algorithm 1 of the paper, with its losses; in small batches, which are the most updates that two cores give. Where the
 # unroll grows by more at once, what worked for a few steps runs away within more.
@@ -87,6 +91,13 @@ KICK = (
     Stage("impacts2", "contacts", replace(IMPACTS, updates=14000)),
     Stage("responses", "", RESPONSES),
 )
+
+
+def stages_of(chosen: Scenario) -> tuple[Stage, ...]:
+    """How the weights of a scene are trained over mechanics."""
+    if not chosen.strikes:
+        return GENERAL
+    return STRIKING_BALLS if any(chosen.scene.body(pair.second).is_ball for pair in chosen.scene.pairs) else STRIKING
 
 
 def planned_episodes(kick: Kick, weights: Path, tasks: int, elites: int, seed: int) -> tuple[Episodes, int]:
@@ -137,6 +148,7 @@ def stored_episodes(path: Path, scene: Scene, make: Callable[[], tuple[Episodes,
 def main(
     scene: str = WEIGHTS,
     design: DesignName | None = None,
+    size: SizeName | None = None,
     folder: Path | None = None,
     out: Path | None = None,
     episodes: int = 10000,
@@ -149,8 +161,9 @@ def main(
     Args:
         scene: what is simulated; human_ball is the kick's.
         design: which parts it is made of; compact for the kick and hybrid for all else by default.
-        folder: where the run keeps its stages and checkpoints; runs/train/SCENE by default, SCENE_DESIGN where
-            one is given.
+        size: of the hybrid's networks; base for any_human and small for all else by default.
+        folder: where the run keeps its stages and checkpoints; runs/train/SCENE by default, SCENE_DESIGN_SIZE where
+            they are given.
         out: where the weights and their manifest go; a folder of the run's by default.
         episodes: random truth episodes.
         tasks: kicks planned for the candidates of each stage that adds some.
@@ -158,16 +171,21 @@ def main(
         seed: of the data and the training; the benchmarks use seeds below 100.
     """
     console, chosen = Console(), scenario(scene)
-    folder = folder or trained_at(chosen.name, design)
+    folder = folder or trained_at(chosen.name, design, size)
     remember_compilations()
     design = design or ("compact" if chosen.name == WEIGHTS else "hybrid")
     kick = prepare() if (chosen.name, design) == (WEIGHTS, "compact") else None
-    stages = PAPER if design == "paper" else KICK if kick else STRIKING if chosen.strikes else GENERAL
-    model = designs.DESIGNS[design](chosen.scene)
+    stages = PAPER if design == "paper" else KICK if kick else stages_of(chosen)
+    if design == "hybrid":
+        model = designs.hybrid(chosen.scene, designs.SIZES[size or ("base" if chosen.name == ANY_HUMAN else "small")])
+    elif size:
+        raise ValueError(f"size is {size!r}, but only the hybrid design comes in sizes, not {design!r}")
+    else:
+        model = designs.DESIGNS[design](chosen.scene)
     random = stored_episodes(folder / "random.npz", chosen.scene, lambda: chosen.draw(episodes, seed), console)
     sources = [random]
     if chosen.strikes:
-        near = partial(contact_episodes, chosen.scene, random, 2 * episodes, seed + 1)
+        near = partial(contact_episodes, chosen.scene, random, CONTACTS * episodes, seed + 1)
         sources.append(stored_episodes(folder / "contacts.npz", chosen.scene, near, console))
     learned: Weights | None = None
     rounds: list[dict[str, Any]] = []

@@ -43,13 +43,13 @@ def episodes(scene: Scene, reference: Reference) -> Episodes:
 @pytest.fixture(scope="session")
 def compact(scene: Scene) -> Model:
     """The shipped kind of model, as small as it can be."""
-    return designs.compact(scene, designs.TINY)
+    return designs.compact(scene, designs.LEAST)
 
 
 @pytest.fixture(scope="session")
 def paper(scene: Scene) -> Model:
     """The paper's kind of model, as small as it can be."""
-    return designs.paper(scene, designs.TINY)
+    return designs.paper(scene, designs.LEAST)
 
 
 def random_weights(model: Model, episodes: Episodes) -> Weights:

@@ -1,8 +1,7 @@
-"""Fitting weights to a motion and a body: what is promised of time, of the better of both, and of bad input."""
+"""Fitting weights to a motion and a body: what is promised of the better of both, of training time, of bad input."""
 
 import json
 import math
-import time
 from pathlib import Path
 
 import jax
@@ -26,7 +25,7 @@ SCENE = human_and_ball()
 def manifest(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Weights of the least networks, hardly trained."""
     folder = tmp_path_factory.mktemp("weights")
-    model = designs.compact(SCENE, designs.TINY)  # compiles sooner than one over mechanics
+    model = designs.compact(SCENE, designs.LEAST)  # compiles sooner than one over mechanics
     episodes, _ = random_episodes(SCENE, prepare().reference, 64, 3)
     windows = training.Windows(SCENE, [(episodes, 1.0)], OVER_MECHANICS)
     weights = training.statistics_of(model, windows, np.random.default_rng(0), batches=1)
@@ -59,21 +58,19 @@ def test_bad_input_is_refused_before_anything_is_drawn(
     assert not list((tmp_path / "out").glob("*.json"))
 
 
-def test_adapting_keeps_its_time_says_that_it_extrapolates_and_writes_the_better_of_both(
+def test_adapting_says_that_it_extrapolates_and_writes_the_better_of_both(
     manifest: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name, value in (("LEAST", 0.0), ("HELD_OUT", 8), ("FEWEST", 24), ("MOST", 24), ("CHECKING", 5.0)):
         monkeypatch.setattr(adapt, name, value)
-    begin = time.perf_counter()
     adapt.main(height=1.6, mass=50.0, minutes=1.0, weights=manifest, out=tmp_path)
-    took = time.perf_counter() - begin
     said = capsys.readouterr().out
-    content = json.loads((tmp_path / f"{ANY_HUMAN}.json").read_text())["recipe"]
-    assert "beyond what the weights know: human." in said and took < 120.0
+    content = json.loads((tmp_path / "adapted.json").read_text())["recipe"]
+    assert "beyond what the weights know: human." in said
     before, after = (Checked(tuple(content[name]["human"]), content[name]["launch"]) for name in ("before", "after"))
     assert content["kept"] == ("after" if after.better_than(before) else "before")
-    stored.load(tmp_path / f"{ANY_HUMAN}.json", human_and_ball(height=1.6, mass=50.0))
-    stored.load(tmp_path / f"{ANY_HUMAN}.json", SCENE)
+    stored.load(tmp_path / "adapted.json", human_and_ball(height=1.6, mass=50.0))
+    stored.load(tmp_path / "adapted.json", SCENE)
 
 
 def test_training_for_a_time_takes_that_time(manifest: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from mpc import evaluate
 from tasks import kick, sensing
 from tasks.data import random_roll
 from tasks.gap import contact_step, events, gap
-from tasks.standing import Standing
+from tasks.references import standing_on_ground
+from tasks.standing import HORIZON, SWUNG, Standing
 
 
 @pytest.fixture(scope="module")
@@ -21,17 +23,41 @@ def task() -> kick.Kick:
     return kick.prepare()
 
 
-def test_standing_costs_nothing_on_the_reference_itself_and_leaning_costs(task: kick.Kick) -> None:
+def stood(task: kick.Kick, standing: Standing) -> jax.Array:
+    """States (HORIZON, n, 13) of the human at rest in the stance."""
+    upright = standing_on_ground(task.scene, standing.stance[None], Rotation.identity(1))
+    return jnp.repeat(jnp.asarray(upright[:, task.human]), HORIZON, axis=0)
+
+
+@pytest.mark.parametrize(
+    ("term", "column", "links", "by"),
+    [
+        ("balance", 7, slice(None), 0.5),
+        ("upright", 2, slice(None), -0.2),
+        ("feet", 2, slice(12, 13), 0.1),
+        ("lean", 4, slice(0, 1), 0.2),
+    ],
+)
+def test_standing_still_costs_next_to_nothing_and_what_leads_to_a_fall_costs(
+    task: kick.Kick, term: str, column: int, links: slice, by: float
+) -> None:
     standing = Standing(task.scene, task.reference)
-    window = standing.window(40)
-    states, controls = task.reference.window(40, len(window.controls))
-    human = jnp.asarray(states[:, task.human])
-    total, _ = evaluate(standing.terms, human, jnp.asarray(controls), window.context)
-    assert float(total) == pytest.approx(0.0, abs=1e-9)
-    pushed = human.at[..., 7].add(0.5)
-    assert evaluate(standing.terms, pushed, jnp.asarray(controls), window.context)[1]["balance"] > 0.1
-    sunk = human.at[..., 2].add(-0.2)
-    assert evaluate(standing.terms, sunk, jnp.asarray(controls), window.context)[1]["upright"] > 0.1
+    window = standing.window(task.reference.strike + 60)
+    human, controls = stood(task, standing), jnp.asarray(window.controls)
+    np.testing.assert_allclose(window.controls, np.broadcast_to(standing.stance, window.controls.shape))
+    total, _ = evaluate(standing.terms, human, controls, window.context)
+    assert float(total) < 0.5
+    worse = human.at[:, links, column].add(by)
+    assert evaluate(standing.terms, worse, controls, window.context)[1][term] > 0.2
+
+
+def test_the_targets_go_from_the_kick_to_the_stance_without_a_jump(task: kick.Kick) -> None:
+    standing = Standing(task.scene, task.reference)
+    controls = np.stack([standing.window(step).controls[0] for step in range(task.reference.strike, 200)])
+    last = task.reference.window(task.reference.strike + SWUNG // 2, 1)[1]
+    np.testing.assert_array_equal(controls[0], last[0])
+    assert np.abs(np.diff(controls, axis=0)).max() < 0.1
+    np.testing.assert_array_equal(controls[-1], standing.stance)
 
 
 def test_the_capture_point_at_rest_is_below_the_centre_of_mass_and_moves_ahead_with_speed(task: kick.Kick) -> None:
@@ -39,8 +65,8 @@ def test_the_capture_point_at_rest_is_below_the_centre_of_mass_and_moves_ahead_w
     human = jnp.asarray(task.reference.states[0, task.human]).at[:, packed.VELOCITY].set(0.0)
     mass = np.array([link.mass for link in task.scene.bodies[0].links])
     centre = mass @ np.asarray(human[:, packed.POSITION]) / mass.sum()
-    foot = np.asarray(human[standing.foot, :2])
-    np.testing.assert_allclose(standing.capture_point(human), centre[:2] - foot, atol=1e-6)
+    middle = np.asarray(human[standing.feet, :2]).mean(axis=0)
+    np.testing.assert_allclose(standing.capture_point(human), centre[:2] - middle, atol=1e-6)
     moving = human.at[:, 7].set(1.0)
     ahead = standing.capture_point(moving) - standing.capture_point(human)
     np.testing.assert_allclose(ahead, [np.sqrt(centre[2] / task.scene.gravity), 0.0], rtol=1e-5, atol=1e-6)

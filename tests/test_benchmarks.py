@@ -87,8 +87,8 @@ def test_the_kick_benchmark_keeps_its_rows_and_touches_no_results(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     report.RESULTS.write_text("# Results\n")
-    search = (CEM(samples=16, rounds=1, elites=4),)
-    monkeypatch.setitem(PRESETS, "fast", Preset(search, search, every=40))
+    search = (CEM(samples=8, rounds=1, elites=2),)
+    monkeypatch.setitem(PRESETS, "fast", Preset(search, search, every=40, stand=search))
     kick.main(targets=1, preset="fast", dynamics="mujoco", substeps=4)
     found = json.loads(Path("runs/benchmarks/kick_fast_mujoco_substeps_4.json").read_text())
     (row,) = found["rows"]

@@ -25,7 +25,7 @@ from tasks.scenarios import scenario
 
 STEPS = 5
 SCENE = two_chains(2)
-MODEL = designs.hybrid(SCENE, designs.TINY)
+MODEL = designs.hybrid(SCENE, designs.LEAST)
 SOON = {"xla_backend_optimization_level": 0}
 ROLL = jax.jit(rollout, static_argnums=0, compiler_options=SOON)
 

@@ -66,6 +66,15 @@ def test_the_standing_height_is_that_of_the_closed_up_rest_pose() -> None:
     assert state[0, 2] == pytest.approx(standing_height(scene.bodies[0]), abs=1e-9)
 
 
+def test_the_weights_of_the_embedded_kick_are_used_for_it_alone() -> None:
+    usual, clip = human_and_ball(), Path("clip.bvh")
+    assert kick.shipped(usual, None).name == "human_ball.json"
+    for scene, reference in ((usual, clip), (human_and_ball(height=1.6), None), (human_and_ball(mass=90.0), clip)):
+        assert kick.shipped(scene, reference).name == "any_human.json"
+    for scene, reference in ((usual, None), (human_and_ball(height=1.6, mass=50.0), None)):
+        stored.load(kick.shipped(scene, reference), scene)
+
+
 def test_the_ball_distance_counts_the_way_between_steps() -> None:
     path = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
     assert kick.miss(path, np.array([1.0, 0.3, 0.0])) == pytest.approx(0.3, abs=1e-6)

@@ -66,7 +66,7 @@ def case(request: pytest.FixtureRequest, episodes: Episodes, chains: Episodes) -
         rows = np.flatnonzero(contacts >= 0)[:6]
         before, after = (given.states[rows, contacts[rows] + later] for later in (0, 1))
         controls, torques = given.controls[rows, contacts[rows]], given.torques[rows, contacts[rows]]
-        model = MAKE[design](scene, designs.TINY)
+        model = MAKE[design](scene, designs.LEAST)
         found = jax.jit(partial(measure, model), compiler_options=SOON)(before, after, controls, torques)
         weights = initial_weights(model, jax.random.key(0), found)
     states = before.astype(float)

@@ -227,7 +227,7 @@ def test_bodies_without_motors_that_strike_each_other_are_simulated() -> None:
     state[:, 2, :3] = [(0.0, 0.15, 1.0), (0.0, 3.0, 1.0)]
     state[:, 2, 8] = -8.0
     nothing = jnp.zeros((2, 0, 3)), jnp.zeros((2, 3, 3))
-    model = designs.compact(scene, designs.TINY)
+    model = designs.compact(scene, designs.LEAST)
     statistics = jax.jit(partial(measure, model), compiler_options=SOON)(state, state, *nothing)
     simulator = Simulator(model, initial_weights(model, jax.random.key(0), statistics))
     struck, missed = roll(simulator, state, np.zeros((2, 2, 0, 3)))[:, 0, :, packed.VELOCITY]

@@ -24,7 +24,7 @@ from larp_model.truth.episodes import Episodes, record
 from larp_model.truth.mujoco import Truth
 
 SWING = Scene((chain(links=2),))
-MODEL = designs.compact(SWING, designs.TINY)
+MODEL = designs.compact(SWING, designs.LEAST)
 SHORT = Recipe(updates=200, batch=16, curriculum=((2, 1.0),), learning_rate=3e-3)
 
 
@@ -150,7 +150,7 @@ def test_training_on_bad_data_alone_stops_with_the_last_good_weights(swings: Epi
 
 def test_training_in_the_world_frame_turns_its_data(swings: Episodes, tmp_path: Path) -> None:
     recipe = dataclasses.replace(SHORT, updates=100)
-    weights, log = train(designs.paper(SWING, designs.TINY), recipe, [(swings, 1.0)], tmp_path, quiet=True)
+    weights, log = train(designs.paper(SWING, designs.LEAST), recipe, [(swings, 1.0)], tmp_path, quiet=True)
     assert log["dropped"] == 0 and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(weights))
     spread = np.asarray(weights.inputs["dynamics/chain2"].mean)[2:32]
     assert np.abs(spread).max() < 3.0

@@ -44,7 +44,7 @@ def test_what_is_saved_is_what_is_loaded(
 
 def test_weights_of_a_ball_alone_survive(tmp_path: Path) -> None:
     scene = Scene((ball(),))
-    model = designs.compact(scene, designs.TINY)
+    model = designs.compact(scene, designs.LEAST)
     state = jnp.zeros((2, 1, 13)).at[..., 3].set(1.0)
     statistics = measure(model, state, state, jnp.zeros((2, 0, 3)), jnp.zeros((2, 1, 3)))
     weights = initial_weights(model, jax.random.key(0), statistics)

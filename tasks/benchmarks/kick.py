@@ -11,12 +11,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from larp_model import weights as stored
-from larp_model.bodies import human_and_ball
 from larp_model.truth.mujoco import FINE_SUBSTEPS
 from tasks.benchmarks import report
 from tasks.data import random_roll, random_task
-from tasks.kick import HEIGHT, WEIGHTS, Kick, Models, models_of, planners_of, prepare, remember_compilations, run
+from tasks.kick import HEIGHT, Kick, Models, models_of, planners_of, prepare, remember_compilations, run, shipped
 from tasks.presets import Preset, Seconds, preset_of, within
 from tasks.sensing import noisy
 from tasks.standing import Standing
@@ -99,7 +97,7 @@ def main(
     preset: str = "balanced",
     dynamics: str = "larp",
     json: Path | None = None,
-    weights: Path = stored.SHIPPED / f"{WEIGHTS}.json",
+    weights: Path | None = None,
     reference: Path | None = None,
     height: float = HEIGHT,
     rolling: float = 0.0,
@@ -116,9 +114,9 @@ def main(
         preset: fast, balanced or accurate.
         dynamics: the planner's model: larp or mujoco.
         json: where the figures go; the picture goes beside them.
-        weights: manifest of the weights of the learned model.
+        weights: manifest of the weights of the learned model; those shipped for the kick by default.
         reference: a captured kick (BVH) instead of the embedded one.
-        height: of the human [m]; the weights know one of 1.75 m.
+        height: of the human [m].
         rolling: greatest speed [m/s] of a ball that comes from ahead or from the kicking side; 0: it rests.
         noise: show the planner the state with sensing noise.
         budget: seconds for the first plan, and a fifth of them for each replan; the preset is scaled to fit.
@@ -144,8 +142,7 @@ def main(
     report.ready(json, publish)
     remember_compilations()
     kick = prepare(reference, height, substeps)
-    trained_on = human_and_ball() if height != HEIGHT else None
-    models = models_of(kick.scene, dynamics, weights, trained_on)  # type: ignore[arg-type]
+    models = models_of(kick.scene, dynamics, weights or shipped(kick.scene, reference))  # type: ignore[arg-type]
     if budget is not None:
         chosen = within(chosen, budget, partial(seconds_of, kick, models))
     planners = planners_of(kick, chosen, models)

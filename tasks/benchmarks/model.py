@@ -91,7 +91,11 @@ def main(
     if sequences < 1:
         raise ValueError(f"sequences is {sequences}, but must be at least 1")
     manifest = weights_of(scene, weights)
-    what = [scene, *([reference.stem] if reference else []), *(["bodies varied"] if bodies == "varied" else [])]
+    what = [
+        scene,
+        *(path.stem for path in (weights, reference) if path),
+        *(["bodies varied"] if bodies == "varied" else []),
+    ]
     name = "_".join(["model", *what]).replace(" ", "_")
     json = json or Path(f"runs/benchmarks/{name}.json")
     report.ready(json, publish)
@@ -105,7 +109,7 @@ def main(
     found = judged(manifest, chosen, episodes)
     source = f"--states {states.name}" if states else f"--sequences {sequences} --seed {seed}"
     if weights:
-        source = f"--weights {weights.name} {source}"
+        source = f"--weights {weights} {source}"
     if reference:
         source += f" --reference {reference.name}"
     if bodies == "varied":

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from larp_model import contact, kinematics
 from larp_model import state as packed
 from larp_model.bodies import KICKING_LINKS, ball, capsule, chain, human
-from larp_model.designs import TINY, compact
+from larp_model.designs import LEAST, compact
 from larp_model.parts.part import initial_weights, measure
 from larp_model.scene import Pair, Scene
 from larp_model.simulator import Simulator
@@ -552,7 +552,7 @@ def untrained(scene: Scene, seed: int) -> Simulator:
     """A simulator of the scene with small random networks, its inputs measured on wild states."""
     states = wild(scene, 64, np.random.default_rng(seed)).astype(np.float32)
     control, torque = jnp.zeros((64, len(scene.motors), 3)), jnp.zeros((64, len(scene.links), 3))
-    model = compact(scene, TINY)
+    model = compact(scene, LEAST)
     measured = measure(model, jnp.asarray(states), jnp.asarray(states[::-1].copy()), control, torque)
     return Simulator(model, initial_weights(model, jax.random.key(seed), measured))
 
