@@ -1,7 +1,7 @@
 """Ten minutes for yours: the shipped weights, fitted to a motion and a body of the user's own.
 
-Truth around that motion and body, training on from the weights, and a check on episodes that neither saw, before and
-after. What is written is the better of both.
+Truth around that motion and body and of what the planner tries there, training on from the weights, and a check on
+episodes that neither saw, before and after. What is written is the better of both.
 """
 
 from __future__ import annotations
@@ -23,16 +23,19 @@ from larp_model.files import require_writable
 from larp_model.networks import Weights
 from larp_model.parts.part import Model
 from larp_model.simulator import Simulator
+from larp_model.truth import episodes as truth_episodes
 from larp_model.truth.episodes import Episodes
 from larp_model.weights import Trained
-from tasks.data import WINDOWS, contact_episodes, random_episodes
-from tasks.kick import HEIGHT, prepare, remember_compilations, run
+from tasks.data import WINDOWS, random_episodes
+from tasks.kick import HEIGHT, learned_models, prepare, remember_compilations, run
 from tasks.scenarios import ANY_HUMAN
-from tasks.train import HUMAN, IMPACTS, OVER_MECHANICS
+from tasks.train import HUMAN, IMPACTS, OVER_MECHANICS, on_policy_contacts, planned_episodes
 
-# Episodes that weights are checked on, the fewest to learn from, and shares of the time: truth; of what is then left,
-# the swing before the impact.
-HELD_OUT, FEWEST, TRUTH, SWING = 64, 256, 0.25, 0.65
+# Episodes that weights are checked on, those drawn at a time, and shares of the time: random truth, and what the
+# planner tries; of what is then left, the swing before the impact.
+HELD_OUT, DRAWN, TRUTH, PLANS, SWING = 64, 256, 0.15, 0.2, 0.55
+# Of each plan so many candidates, and more kicks than are planned in any time.
+ELITES, KICKS = 8, 100
 # The check at the end [s], and the least that is worth beginning [min].
 CHECKING, LEAST = 20.0, 2.0
 # Learning rate of what has learned already, and more updates than fit into any time.
@@ -65,18 +68,18 @@ def check(model: Model, weights: Weights, episodes: Episodes) -> Checked:
 def trained_on(
     model: Model,
     learned: Weights,
-    long: Episodes,
+    long: list[Episodes],
     short: Episodes,
     folder: Path,
     seconds: tuple[float, float],
     seed: int,
 ) -> Weights:
-    """Weights trained on for so many seconds: the human's swing on long episodes, then its impacts on both."""
+    """Weights trained on for so many seconds: the human's swing on long episodes, then impacts on short too."""
     swing = replace(OVER_MECHANICS, learning_rate=RATE, updates=MOST, seed=seed, only=HUMAN)
     impact = replace(IMPACTS, learning_rate=RATE, updates=MOST, seed=seed + 1)
     for name, recipe, sources, limit in (
-        ("swing", swing, [long], seconds[0]),
-        ("impact", impact, [long, short], seconds[1]),
+        ("swing", swing, long, seconds[0]),
+        ("impact", impact, [*long, short], seconds[1]),
     ):
         learned, _ = training.train(
             model, recipe, [(each, 1.0) for each in sources], folder / name, learned, seconds=limit
@@ -86,6 +89,7 @@ def trained_on(
 
 def main(
     reference: Path | None = None,
+    names: Path | None = None,
     height: float = HEIGHT,
     mass: float | None = None,
     minutes: float = 10.0,
@@ -96,7 +100,8 @@ def main(
     """Fit the weights of the learned simulator to a motion and a body.
 
     Args:
-        reference: a captured kick (BVH); the embedded one by default.
+        reference: a captured kick (BVH, or npz of joint angles); the embedded one by default.
+        names: JSON object of what the BVH file calls our joints: {"Hips": "pelvis", ...}; known skeletons need none.
         height: of the human [m].
         mass: of the human [kg]; as heavy as its height squared by default.
         minutes: that it may take.
@@ -118,24 +123,28 @@ def main(
         console.print(f"{what}; {left:.1f} min left")
 
     model, start, content = stored.load(weights, human_and_ball())
-    kick = prepare(reference, height, mass=mass)
+    kick = prepare(reference, height, mass=mass, names=names)
     scene, known = kick.scene, stored.trained_sizes(content)
     model = model.on(scene)
     for difference in (each for body in scene.bodies for each in stored.beyond(body, known[body.kind])):
         console.print(f"beyond what the weights know: {difference}")
         break
-    drawing = time.perf_counter()
     held_out, _ = random_episodes(scene, kick.reference, HELD_OUT, 1_000_000 + seed)
-    each = (time.perf_counter() - drawing) / HELD_OUT
     before = check(model, start, held_out)
     tell(f"{HELD_OUT} episodes to check on; {described(before)}")
-    count = int(np.clip(TRUTH * whole / each, FEWEST, MOST))
-    long, _ = random_episodes(scene, kick.reference, count, seed)
-    short, _ = contact_episodes(scene, long, count, seed)
-    tell(f"{len(long.states)} episodes to learn from, and {len(short.states)} of impacts")
+    drawing = time.perf_counter()
+    parts: list[Episodes] = []
+    while not parts or (time.perf_counter() - drawing < TRUTH * whole and len(parts) * DRAWN < MOST):
+        parts.append(random_episodes(scene, kick.reference, DRAWN, seed + len(parts))[0])
+    long = truth_episodes.join(parts)
+    tried, _ = planned_episodes(kick, learned_models(scene, model, start, "start"), KICKS, ELITES, seed, PLANS * whole)
+    short, _ = on_policy_contacts(scene, long, tried, len(long.states), seed)
+    tell(f"{len(long.states)} random episodes, {len(tried.states)} of plans, {len(short.states)} of impacts")
     left = whole - (time.perf_counter() - begin) - CHECKING
     with tempfile.TemporaryDirectory() as folder:
-        learned = trained_on(model, start, long, short, Path(folder), (SWING * left, (1.0 - SWING) * left), seed)
+        learned = trained_on(
+            model, start, [long, tried], short, Path(folder), (SWING * left, (1.0 - SWING) * left), seed
+        )
     after = check(model, learned, held_out)
     tell(f"trained; {described(after)}")
     better = after.better_than(before)

@@ -17,7 +17,7 @@ import io
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -34,6 +34,8 @@ from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.bodies import human_and_ball, standing_height
 from larp_model.files import require_writable, write_whole
+from larp_model.networks import Weights
+from larp_model.parts.part import Model
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from larp_model.truth.mujoco import FINE_SUBSTEPS, SUBSTEPS, Truth
@@ -53,6 +55,7 @@ from mpc.loop import Execution, Phase, Replan, Window, execute
 from tasks import references, residuals
 from tasks.data import stray
 from tasks.gap import contact_step, gap, told
+from tasks.motions.bvh import names_in
 from tasks.presets import Preset, preset_of, usable
 from tasks.references import Reference
 from tasks.scenarios import ANY_HUMAN
@@ -301,25 +304,36 @@ def shipped(scene: Scene, reference: Path | None) -> Path:
 def models_of(scene: Scene, name: DynamicsName, weights: Path, substeps: int = SUBSTEPS, rows: int = ROWS) -> Models:
     """The planners' models; that of the scene goes on with the ball alone once no link can reach it any more.
 
-    After the kick the human moves as it must: whatever the weights, those shipped for any human predict it then.
+    After the kick the human moves as it must: the shipped weights of the embedded kick leave it to those of any human.
     substeps: engine steps in a step of MuJoCo. rows: candidates that it rolls out side by side.
     """
-    human, ball = scene.bodies[0].name, scene.bodies[-1].name
-
-    parts = [scene.only(*bodies) for bodies in ((human, ball), (ball,), (human,))]
-    models: list[Dynamics]
-    if name == "larp":
-        learned, tensors, manifest = stored.load(weights, scene)
-        moving, motion, _ = stored.load(stored.SHIPPED / f"{ANY_HUMAN}.json", parts[2])
-        models = [*(Simulator(learned.on(part), tensors) for part in parts[:2]), Simulator(moving, motion)]
-        used = manifest["sha256"][:12]
-    elif name == "mujoco":
-        models, used = [MujocoDynamics(Truth(part, rows, substeps)) for part in parts], "none"
-    else:
+    if name == "mujoco":
+        return _continued(scene, [MujocoDynamics(Truth(part, rows, substeps)) for part in _parts(scene)], "none")
+    if name != "larp":
         raise ValueError(f"dynamics is {name!r}, but must be 'larp' or 'mujoco'")
-    whole, alone, after = models
-    rest = slice(scene.rows(human).stop, None)
-    return Models(Continued(whole, alone, rest, FLIGHT), after, name == "larp", used)
+    model, learned, manifest = stored.load(weights, scene)
+    found = learned_models(scene, model, learned, manifest["sha256"][:12])
+    if weights != stored.SHIPPED / f"{WEIGHTS}.json":
+        return found
+    any_human, motion, _ = stored.load(stored.SHIPPED / f"{ANY_HUMAN}.json", _parts(scene)[2])
+    return found._replace(human=Simulator(any_human, motion))
+
+
+def learned_models(scene: Scene, model: Model, weights: Weights, name: str) -> Models:
+    """The planners' models by learned parts; see `models_of`. name: of the weights."""
+    return _continued(scene, [Simulator(model.on(part), weights) for part in _parts(scene)], name)
+
+
+def _parts(scene: Scene) -> tuple[Scene, Scene, Scene]:
+    """Human and ball, the ball, and the human."""
+    human, ball = scene.bodies[0].name, scene.bodies[-1].name
+    return scene.only(human, ball), scene.only(ball), scene.only(human)
+
+
+def _continued(scene: Scene, models: Sequence[Dynamics], weights: str) -> Models:
+    whole, ball, human = models
+    rest = slice(scene.rows(scene.bodies[0].name).stop, None)
+    return Models(Continued(whole, ball, rest, FLIGHT), human, weights != "none", weights)
 
 
 def planners_of(kick: Kick, preset: Preset, models: Models) -> Planners:
@@ -412,16 +426,29 @@ def table(summary: dict[str, Any]) -> Table:
 
 
 def prepare(
-    body_reference: Path | None = None, height: float = HEIGHT, substeps: int = FINE_SUBSTEPS, mass: float | None = None
+    body_reference: Path | None = None,
+    height: float = HEIGHT,
+    substeps: int = FINE_SUBSTEPS,
+    mass: float | None = None,
+    names: Path | None = None,
 ) -> Kick:
-    """The kick's scene with its reference: the embedded one, or a captured one from a BVH file.
+    """The kick's scene with its reference: the embedded one, or a captured one from a BVH or an npz file.
 
     height: of the human [m]. substeps: engine steps of the truth in a step. mass: of the human [kg]; as heavy as its
-    height squared by default.
+    height squared by default. names: JSON file of what a BVH file calls our joints; see `bvh.load`.
     """
     scene = human_and_ball(height=height, mass=MASS * (height / HEIGHT) ** 2 if mass is None else mass)
-    reference = references.embedded(scene) if body_reference is None else references.captured(body_reference, scene)
-    return Kick(scene, reference, substeps)
+    return kick_of(scene, body_reference, substeps, names)
+
+
+def kick_of(
+    scene: Scene, body_reference: Path | None, substeps: int = FINE_SUBSTEPS, names: Path | None = None
+) -> Kick:
+    """The kick of a scene's human, as `prepare` makes it."""
+    if body_reference is None:
+        return Kick(scene, references.embedded(scene), substeps)
+    called = None if names is None else names_in(names)
+    return Kick(scene, references.captured(body_reference, scene, names=called), substeps)
 
 
 def main(
@@ -429,6 +456,7 @@ def main(
     preset: str = "balanced",
     dynamics: str = "larp",
     reference: Path | None = None,
+    names: Path | None = None,
     weights: Path | None = None,
     height: float = HEIGHT,
     mass: float | None = None,
@@ -443,7 +471,8 @@ def main(
         target: where the ball's centre should pass [m]: forwards, to the left, up.
         preset: fast, balanced or accurate.
         dynamics: the planner's model: larp (learned) or mujoco.
-        reference: a captured kick (BVH) instead of the embedded one.
+        reference: a captured kick (BVH, or npz of joint angles) instead of the embedded one.
+        names: JSON object of what the BVH file calls our joints: {"Hips": "pelvis", ...}; known skeletons need none.
         weights: manifest of the weights of the learned model; those shipped for the kick by default.
         height: of the human [m].
         mass: of the human [kg]; as heavy as its height squared by default.
@@ -458,7 +487,7 @@ def main(
     chosen = preset_of(preset)
     require_writable(out, "out")
     remember_compilations()
-    kick = prepare(reference, height, mass=mass)
+    kick = prepare(reference, height, mass=mass, names=names)
     models = models_of(kick.scene, dynamics, weights or shipped(kick.scene, reference))  # type: ignore[arg-type]
     planners = planners_of(kick, chosen, models)
     page = LivePage(port=port) if view else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,8 +14,10 @@ from larp_model import state as packed
 from larp_model.bodies import standing_height
 from larp_model.scene import Body, Link, Scene
 from larp_model.truth.mujoco import Truth, closed, finite
-from tasks import bvh, key_poses
+from tasks import key_poses
 from tasks.key_poses import KeyPoses
+from tasks.motions import angles, bvh, skeleton
+from tasks.motions.skeleton import Motion
 from tasks.tracking import Tracker
 
 # Steps around the strike in which a captured kick may meet its ball.
@@ -114,25 +116,43 @@ def embedded(scene: Scene, steps: int = 300, poses: KeyPoses | None = None) -> R
     return Reference(states, controls, int(moving.argmax()) - 1)
 
 
-def captured(path: str | Path, scene: Scene, seconds_before: float = 0.6, seconds_after: float = 1.0) -> Reference:
-    """A captured kick (BVH), performed in the truth by the human of `scene`, who follows the clip around its strike.
+def motion_of(path: Path, names: Mapping[str, str] | None = None) -> Motion:
+    """The motion of a BVH file or of an npz file; see `captured`."""
+    if path.suffix.lower() != ".npz":
+        return bvh.load(path, names)
+    if names is not None:
+        raise ValueError(f"names are for BVH files, but {path.name} is none: its field joints says the order")
+    return angles.load(path)
 
-    The ball waits where the foot, as performed, would strike it hardest. The whole is turned and moved so that the
-    ball leaves along the x axis (the human starts beside it), and mirrored if the kicking foot is the left.
-    ValueError where the file is not understood, is no kick, or no ball is hit.
+
+def captured(
+    source: str | Path | Motion,
+    scene: Scene,
+    seconds_before: float = 0.6,
+    seconds_after: float = 1.0,
+    names: Mapping[str, str] | None = None,
+) -> Reference:
+    """A captured kick, performed in the truth by the human of `scene`, who follows it around its strike.
+
+    source: a BVH file, an npz file of joint angles (see `angles.load`), or a motion. The ball waits where the foot, as
+    performed, would strike it hardest. The whole is turned and moved so that the ball leaves along the x axis (the
+    human starts beside it), and mirrored if the kicking foot is the left. names: what a BVH file calls our joints, as
+    in `bvh.load`; by default, the known skeleton that fits it. ValueError where the file is not understood, is no
+    kick, or no ball is hit.
     """
     for name, value in (("seconds_before", seconds_before), ("seconds_after", seconds_after)):
         if not 0.2 <= value <= 10.0:
             raise ValueError(f"{name} is {value!r}, but must be from 0.2 to 10 s")
-    motion = bvh.load(path)
-    if (fastest := bvh.toe_speed(motion).max()) < bvh.SLOWEST_KICK:
-        raise ValueError(f"{path} is no kick: its toes reach {fastest:.1f} m/s, but need {bvh.SLOWEST_KICK:g} m/s")
-    if bvh.kicking_side(motion) == "Left":
-        motion = bvh.mirrored(motion)
-    frame = bvh.strike(motion)
+    motion = source if isinstance(source, Motion) else motion_of(Path(source), names)
+    path = "the motion" if isinstance(source, Motion) else source
+    if (fastest := skeleton.toe_speed(motion).max()) < skeleton.SLOWEST_KICK:
+        raise ValueError(f"{path} is no kick: its toes reach {fastest:.1f} m/s, but need {skeleton.SLOWEST_KICK:g} m/s")
+    if skeleton.kicking_side(motion) == "Left":
+        motion = skeleton.mirrored(motion)
+    frame = skeleton.strike(motion)
     clip = motion.cut(frame - round(seconds_before * motion.rate), frame + round(seconds_after * motion.rate))
     wanted, controls = _wanted(scene, clip)
-    expected, last = round(bvh.strike(clip) / clip.rate / scene.dt), len(controls) - 1
+    expected, last = round(skeleton.strike(clip) / clip.rate / scene.dt), len(controls) - 1
     tracker = Tracker(scene, wanted, _importance(scene, len(wanted), expected), controls)
     before, targets = tracker.follow(wanted[0], 0, min(expected + MEETING, last))
     spot, touch = _spot(path, scene, before, expected)
@@ -161,13 +181,13 @@ def _launched_along_x(states: np.ndarray, strike: int) -> np.ndarray:
     return turned
 
 
-def _wanted(scene: Scene, clip: bvh.Motion) -> tuple[np.ndarray, np.ndarray]:
+def _wanted(scene: Scene, clip: Motion) -> tuple[np.ndarray, np.ndarray]:
     """The clip as states (T, L, 13) and joint targets (T, J, 3) [rad] of the human, its ball out of the way.
 
     The targets are ahead of the joint angles by what the servos lag behind: damping / stiffness.
     """
     human, ball = scene.bodies[0], scene.bodies[-1]
-    orientations, poses = bvh.retarget(clip, human, scene.dt)
+    orientations, poses = skeleton.retarget(clip, human, scene.dt)
     root = Rotation.from_quat(orientations, scalar_first=True)
     states = standing_on_ground(scene, poses, root)
     rows = scene.rows(human.name)

@@ -7,6 +7,7 @@ its last checkpoint. So the same command takes up a run that was cut off.
 from __future__ import annotations
 
 import json
+import math
 import os
 import platform
 import time
@@ -32,7 +33,7 @@ from larp_model.truth.episodes import Episodes
 from larp_model.truth.mujoco import SUBSTEPS, Truth
 from mpc import CEM
 from tasks.data import contact_episodes, random_task
-from tasks.kick import WEIGHTS, Kick, models_of, planners_of, prepare, remember_compilations, run
+from tasks.kick import WEIGHTS, Kick, Models, learned_models, planners_of, prepare, remember_compilations, run
 from tasks.presets import Preset
 from tasks.scenarios import ANY_HUMAN, Scenario, scenario, trained_at
 
@@ -100,13 +101,15 @@ def stages_of(chosen: Scenario) -> tuple[Stage, ...]:
     return STRIKING_BALLS if any(chosen.scene.body(pair.second).is_ball for pair in chosen.scene.pairs) else STRIKING
 
 
-def planned_episodes(kick: Kick, weights: Path, tasks: int, elites: int, seed: int) -> tuple[Episodes, int]:
+def planned_episodes(
+    kick: Kick, models: Models, tasks: int, elites: int, seed: int, seconds: float = math.inf
+) -> tuple[Episodes, int]:
     """What the planner tries: of each of its plans on the way to `tasks` kicks some elites, executed in the truth.
 
-    Returns the episodes, of the plans' horizon, and how many diverged.
+    seconds: after which no other kick is begun. Returns the episodes, of the plans' horizon, and how many diverged.
     """
-    random = np.random.default_rng(seed)
-    planners = planners_of(kick, CANDIDATES, models_of(kick.scene, "larp", weights))
+    random, begin = np.random.default_rng(seed), time.perf_counter()
+    planners = planners_of(kick, CANDIDATES, models)
     states, controls = [], []
     for index in range(tasks):
         target, shift = random_task(random)
@@ -117,6 +120,8 @@ def planned_episodes(kick: Kick, weights: Path, tasks: int, elites: int, seed: i
             for knots in np.asarray(replan.plan.elites[:count]):
                 states.append(execution.states[replan.step])
                 controls.append(planners.first.controls(replan.plan._replace(elites=knots[None]), window))
+        if time.perf_counter() - begin > seconds:
+            break
     return truth_episodes.record(Truth(kick.scene, 128), np.stack(states), np.stack(controls))
 
 
@@ -196,10 +201,11 @@ def main(
         return stored.save(into, chosen.name, model, learned, recipe, random.morphology)
 
     for number, stage in enumerate(stages):
-        if stage.adds and kick is not None:
+        if stage.adds and kick is not None and learned is not None:
+            models = learned_models(chosen.scene, model, learned, stage.name)
             later = seed + 1000 * number
             makers = {
-                "planned": partial(planned_episodes, kick, manifest, tasks, 8, later),
+                "planned": partial(planned_episodes, kick, models, tasks, 8, later),
                 "contacts": partial(on_policy_contacts, chosen.scene, random, sources[-1], 2 * episodes, later),
             }
             path = folder / f"{stage.name}.npz"

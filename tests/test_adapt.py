@@ -61,7 +61,7 @@ def test_bad_input_is_refused_before_anything_is_drawn(
 def test_adapting_says_that_it_extrapolates_and_writes_the_better_of_both(
     manifest: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for name, value in (("LEAST", 0.0), ("HELD_OUT", 8), ("FEWEST", 24), ("MOST", 24), ("CHECKING", 5.0)):
+    for name, value in (("LEAST", 0.0), ("HELD_OUT", 8), ("DRAWN", 24), ("MOST", 24), ("CHECKING", 5.0), ("KICKS", 1)):
         monkeypatch.setattr(adapt, name, value)
     adapt.main(height=1.6, mass=50.0, minutes=1.0, weights=manifest, out=tmp_path)
     said = capsys.readouterr().out

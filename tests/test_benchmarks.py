@@ -94,3 +94,9 @@ def test_the_kick_benchmark_keeps_its_rows_and_touches_no_results(
     (row,) = found["rows"]
     assert row["limit_error_m"] == found["mean_limit_error_m"] != row["truth_error_m"]
     assert report.RESULTS.read_text() == "# Results\n"
+
+
+def test_many_bodies_have_neither_one_height_nor_one_budget(tmp_path: Path) -> None:
+    for asked in ({"height": 1.6}, {"budget": 1.0}):
+        with pytest.raises(ValueError, match="bodies is 'varied', but height and budget are those of one body"):
+            kick.main(json=tmp_path / "kick.json", bodies="varied", **asked)  # type: ignore[arg-type]

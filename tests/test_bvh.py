@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from larp_model.bodies import human
 from larp_model.scene import Scene
-from tasks import bvh
 from tasks.benchmarks import reference as benchmark
+from tasks.motions import bvh, skeleton
 from tasks.references import captured
 
 CLIPS = Path(__file__).parents[2] / "shared" / "mocap"
@@ -71,10 +71,10 @@ STANDING: Turns = {"LeftArm": (-90, 0, 0), "RightArm": (90, 0, 0)}
 
 
 @pytest.fixture
-def load(tmp_path: Path) -> Callable[[str], bvh.Motion]:
+def load(tmp_path: Path) -> Callable[[str], skeleton.Motion]:
     """Reads a motion from text."""
 
-    def from_text(content: str) -> bvh.Motion:
+    def from_text(content: str) -> skeleton.Motion:
         path = tmp_path / "clip.bvh"
         path.write_text(content, encoding="utf-8")
         return bvh.load(path)
@@ -106,20 +106,20 @@ def test_forward_kinematics_of_a_leg(
         np.testing.assert_allclose(motion.path(joint), [expected], atol=1e-9)
 
 
-def test_positions_follow_from_orientations_and_offsets(load: Callable[[str], bvh.Motion]) -> None:
+def test_positions_follow_from_orientations_and_offsets(load: Callable[[str], skeleton.Motion]) -> None:
     motion = load(text(*swing(20)))
     for child, parent in enumerate(motion.parents[1:], start=1):
         bone = motion.rotation(motion.names[parent]).apply(motion.offsets[child])
         np.testing.assert_allclose(motion.positions[:, child], motion.positions[:, parent] + bone, atol=1e-9)
 
 
-def test_first_frame_is_left_out_only_if_it_is_a_t_pose(load: Callable[[str], bvh.Motion]) -> None:
+def test_first_frame_is_left_out_only_if_it_is_a_t_pose(load: Callable[[str], skeleton.Motion]) -> None:
     assert len(load(text({}, STANDING, STANDING)).positions) == 2
     assert len(load(text(STANDING, STANDING, STANDING)).positions) == 3
 
 
 @pytest.mark.parametrize("heading", [0.0, 70.0])
-def test_rest_pose_may_face_anywhere(load: Callable[[str], bvh.Motion], heading: float) -> None:
+def test_rest_pose_may_face_anywhere(load: Callable[[str], skeleton.Motion], heading: float) -> None:
     turned = {"Hips": (0.0, heading, 0.0)}
     motion = load(text(turned, turned | STANDING))
     expected = Rotation.from_euler("z", heading, degrees=True).as_matrix()
@@ -157,7 +157,7 @@ GOOD = text({}, STANDING, STANDING)
         (text({"Hips": (90, 0, 0)}, {}).replace("OFFSET 28 0 0", "OFFSET 0 0 28"), "T-pose"),
     ],
 )
-def test_refused_in_one_line(load: Callable[[str], bvh.Motion], content: str, expected: str) -> None:
+def test_refused_in_one_line(load: Callable[[str], skeleton.Motion], content: str, expected: str) -> None:
     with pytest.raises(ValueError, match=expected) as refusal:
         load(content)
     assert str(refusal.value).startswith("clip.bvh ") and "\n" not in str(refusal.value)
@@ -195,26 +195,26 @@ def test_files_with_flipped_bits_are_read_or_refused(damaged: Path, bits: list[i
     load_or_refuse(damaged, bytes(content))
 
 
-def test_mirroring_twice_changes_nothing(load: Callable[[str], bvh.Motion]) -> None:
+def test_mirroring_twice_changes_nothing(load: Callable[[str], skeleton.Motion]) -> None:
     motion = load(text(*swing(10)))
-    again = bvh.mirrored(bvh.mirrored(motion))
+    again = skeleton.mirrored(skeleton.mirrored(motion))
     assert again.names == motion.names
     for field in ("offsets", "positions", "orientations"):
         np.testing.assert_array_equal(getattr(again, field), getattr(motion, field))
 
 
-def test_mirroring_a_right_swing_gives_the_left_one(load: Callable[[str], bvh.Motion]) -> None:
+def test_mirroring_a_right_swing_gives_the_left_one(load: Callable[[str], skeleton.Motion]) -> None:
     right, left = load(text(*swing(10))), load(text(*swing(10, "Left")))
-    assert (bvh.kicking_side(right), bvh.kicking_side(left)) == ("Right", "Left")
-    mirrored = bvh.mirrored(left)
+    assert (skeleton.kicking_side(right), skeleton.kicking_side(left)) == ("Right", "Left")
+    mirrored = skeleton.mirrored(left)
     for name in NAMES:
         np.testing.assert_allclose(mirrored.path(name), right.path(name), atol=1e-9)
-    (_, expected), (_, vectors) = (bvh.retarget(motion, human(), 0.01) for motion in (right, mirrored))
+    (_, expected), (_, vectors) = (skeleton.retarget(motion, human(), 0.01) for motion in (right, mirrored))
     np.testing.assert_allclose(vectors, expected, atol=1e-9)
 
 
-def test_standing_retargets_to_no_rotation(load: Callable[[str], bvh.Motion]) -> None:
-    root, vectors = bvh.retarget(load(text({}, *[STANDING] * 5)), human(), 0.01)
+def test_standing_retargets_to_no_rotation(load: Callable[[str], skeleton.Motion]) -> None:
+    root, vectors = skeleton.retarget(load(text({}, *[STANDING] * 5)), human(), 0.01)
     assert root.shape == (5, 4) and vectors.shape == (5, 12, 3)
     np.testing.assert_allclose(np.abs(root), [[1.0, 0.0, 0.0, 0.0]] * 5, atol=1e-9)
     np.testing.assert_allclose(vectors, 0.0, atol=1e-9)
@@ -232,43 +232,43 @@ def test_standing_retargets_to_no_rotation(load: Callable[[str], bvh.Motion]) ->
     ],
 )
 def test_a_turned_joint_turns_its_link_alone(
-    load: Callable[[str], bvh.Motion],
+    load: Callable[[str], skeleton.Motion],
     joint: str,
     angles: tuple[float, float, float],
     link: str,
     expected: tuple[float, float, float],
 ) -> None:
     body, frame = human(), STANDING | {joint: angles}
-    _, vectors = bvh.retarget(load(text({}, frame, frame)), body, 0.01)
+    _, vectors = skeleton.retarget(load(text({}, frame, frame)), body, 0.01)
     wanted = np.zeros((12, 3))
     wanted[body.link(link) - 1] = expected
     np.testing.assert_allclose(vectors, [wanted] * 2, atol=1e-9)
 
 
-def test_joint_targets_stay_within_the_motors_bounds(load: Callable[[str], bvh.Motion]) -> None:
+def test_joint_targets_stay_within_the_motors_bounds(load: Callable[[str], skeleton.Motion]) -> None:
     bent = STANDING | {"RightLeg": (0.0, 0.0, 170.0), "LeftUpLeg": (0.0, 0.0, 120.0)}
-    _, vectors = bvh.retarget(load(text({}, bent, bent)), human(), 0.01)
+    _, vectors = skeleton.retarget(load(text({}, bent, bent)), human(), 0.01)
     for row, (_, _, motor) in enumerate(human().motors):
         assert (vectors[:, row] >= motor.lower).all() and (vectors[:, row] <= motor.upper).all()
 
 
 @pytest.mark.parametrize("dt", [0.004, 0.01, 0.02])
-def test_retargeting_resamples(load: Callable[[str], bvh.Motion], dt: float) -> None:
-    _, vectors = bvh.retarget(load(text(*swing(41))), human(), dt)
+def test_retargeting_resamples(load: Callable[[str], skeleton.Motion], dt: float) -> None:
+    _, vectors = skeleton.retarget(load(text(*swing(41))), human(), dt)
     assert len(vectors) == round(0.4 / dt) + 1
 
 
-def test_strike_is_where_the_toe_is_fastest(load: Callable[[str], bvh.Motion]) -> None:
+def test_strike_is_where_the_toe_is_fastest(load: Callable[[str], skeleton.Motion]) -> None:
     motion = load(text(*swing(61)))
-    assert bvh.strike(motion) == 30
+    assert skeleton.strike(motion) == 30
     radius = np.linalg.norm((motion.path("RightToeBase") - motion.path("RightUpLeg"))[30])
     rate = np.radians(60.0) * 6.0 / 60.0 * motion.rate  # slope of 60 tanh(x) at 0, x from -3 to 3 in 60 frames
-    assert bvh.toe_speed(motion).max() == pytest.approx(radius * rate, rel=0.03)
+    assert skeleton.toe_speed(motion).max() == pytest.approx(radius * rate, rel=0.03)
 
 
-def test_speeds_need_frames(load: Callable[[str], bvh.Motion]) -> None:
+def test_speeds_need_frames(load: Callable[[str], skeleton.Motion]) -> None:
     with pytest.raises(ValueError, match="frames"):
-        bvh.toe_speed(load(GOOD))
+        skeleton.toe_speed(load(GOOD))
 
 
 def test_a_motion_without_a_kick_is_no_reference(tmp_path: Path, scene: Scene) -> None:
@@ -309,10 +309,10 @@ def test_captured_toe_speeds(name: str) -> None:
     raw, smooth = CAPTURED[name]
     motion = bvh.load(CLIPS / f"{name}.bvh")
     steps = np.linalg.norm(np.diff(motion.path("RightToeBase"), axis=0), axis=-1)
-    assert (motion.rate, bvh.kicking_side(motion)) == (pytest.approx(120.0, rel=1e-3), "Right")
+    assert (motion.rate, skeleton.kicking_side(motion)) == (pytest.approx(120.0, rel=1e-3), "Right")
     assert motion.hip_height == pytest.approx(1.0, rel=0.1)
     assert steps.max() * motion.rate == pytest.approx(raw, rel=0.1)
-    assert bvh.toe_speed(motion).max() == pytest.approx(smooth, rel=0.1)
+    assert skeleton.toe_speed(motion).max() == pytest.approx(smooth, rel=0.1)
 
 
 @with_clips

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -14,7 +14,20 @@ from rich.table import Table
 from larp_model.truth.mujoco import FINE_SUBSTEPS
 from tasks.benchmarks import report
 from tasks.data import random_roll, random_task
-from tasks.kick import HEIGHT, Kick, Models, models_of, planners_of, prepare, remember_compilations, run, shipped
+from tasks.kick import (
+    HEIGHT,
+    Kick,
+    Models,
+    Planners,
+    kick_of,
+    models_of,
+    planners_of,
+    prepare,
+    remember_compilations,
+    run,
+    shipped,
+)
+from tasks.motions.people import random_people
 from tasks.presets import Preset, Seconds, preset_of, within
 from tasks.sensing import noisy
 from tasks.standing import Standing
@@ -100,6 +113,7 @@ def main(
     weights: Path | None = None,
     reference: Path | None = None,
     height: float = HEIGHT,
+    bodies: Literal["usual", "varied"] = "usual",
     rolling: float = 0.0,
     noise: bool = False,
     budget: float | None = None,
@@ -117,6 +131,7 @@ def main(
         weights: manifest of the weights of the learned model; those shipped for the kick by default.
         reference: a captured kick (BVH) instead of the embedded one.
         height: of the human [m].
+        bodies: varied: every kick is another human's, of any size.
         rolling: greatest speed [m/s] of a ball that comes from ahead or from the kicking side; 0: it rests.
         noise: show the planner the state with sensing noise.
         budget: seconds for the first plan, and a fifth of them for each replan; the preset is scaled to fit.
@@ -126,11 +141,14 @@ def main(
     if targets < 1:
         raise ValueError(f"targets is {targets}, but must be at least 1")
     chosen = preset_of(preset)
+    if bodies == "varied" and (height != HEIGHT or budget is not None):
+        raise ValueError("bodies is 'varied', but height and budget are those of one body")
     if not (np.isfinite(rolling) and rolling >= 0.0):
         raise ValueError(f"rolling is {rolling}, but must be a finite speed of at least 0 m/s")
     variant = {
         "reference": reference.stem if reference else "",
         "height": f"{height:g}" if height != HEIGHT else "",
+        "bodies": bodies if bodies != "usual" else "",
         "rolling": f"{rolling:g}" if rolling else "",
         "noise": "on" if noise else "",
         "budget": f"{budget:g}" if budget is not None else "",
@@ -141,14 +159,19 @@ def main(
     json = json or Path(f"runs/benchmarks/{name}.json")
     report.ready(json, publish)
     remember_compilations()
-    kick = prepare(reference, height, substeps)
-    models = models_of(kick.scene, dynamics, weights or shipped(kick.scene, reference))  # type: ignore[arg-type]
-    if budget is not None:
-        chosen = within(chosen, budget, partial(seconds_of, kick, models))
-    planners = planners_of(kick, chosen, models)
+
+    def planned(kick: Kick) -> tuple[Kick, Models, Planners]:
+        models = models_of(kick.scene, dynamics, weights or shipped(kick.scene, reference))  # type: ignore[arg-type]
+        fitting = chosen if budget is None else within(chosen, budget, partial(seconds_of, kick, models))
+        return kick, models, planners_of(kick, fitting, models)
+
+    usual = prepare(reference, height, substeps)
+    people = random_people(np.random.default_rng((seed, 1)), usual.scene, targets)
+    always = planned(usual) if bodies == "usual" else None
     random = np.random.default_rng(seed)
 
     def one(index: int, target: np.ndarray, shift: np.ndarray, roll: np.ndarray) -> report.Row:
+        kick, models, planners = always or planned(kick_of(usual.scene.sized(people[index]), reference, substeps))
         sense = noisy(kick.scene, np.random.default_rng((seed, index))) if noise else lambda state: state
         execution = kick.run(planners, target, seed + index, kick.start(shift, roll), sense=sense)
         return kick.report(execution, target) | {

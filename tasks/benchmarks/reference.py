@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from larp_model import state as packed
 from larp_model.bodies import human_and_ball
 from larp_model.scene import Body, Scene
-from tasks import bvh
 from tasks.benchmarks import report
 from tasks.kick import run
+from tasks.motions import bvh, skeleton
 from tasks.references import Reference, embedded
 
 # The part of a kick that is looked at, around its strike [s].
@@ -56,7 +56,7 @@ class Kick:
     @property
     def kind(self) -> str:
         """What the toe's speed says it is."""
-        return "kick" if self.toe.max() >= bvh.SLOWEST_KICK else "walk"
+        return "kick" if self.toe.max() >= skeleton.SLOWEST_KICK else "walk"
 
     def figures(self) -> dict[str, float]:
         """What the table shows. Backswing: the hip's least flexion and the knee's greatest until the strike."""
@@ -93,15 +93,15 @@ def performed(name: str, scene: Scene, reference: Reference) -> Kick:
 def recorded(path: Path, scene: Scene) -> Kick:
     """The fastest swing of a captured clip, as it was recorded; the toe is the toes' base. Left feet are mirrored."""
     motion = bvh.load(path)
-    if bvh.kicking_side(motion) == "Left":
-        motion = bvh.mirrored(motion)
-    strike = bvh.strike(motion)
+    if skeleton.kicking_side(motion) == "Left":
+        motion = skeleton.mirrored(motion)
+    strike = skeleton.strike(motion)
     clip = motion.cut(strike - round((BEFORE + 0.1) * motion.rate), strike + round((AFTER + 0.1) * motion.rate))
-    _, angles = bvh.retarget(clip, scene.bodies[0], scene.dt)
+    _, angles = skeleton.retarget(clip, scene.bodies[0], scene.dt)
     times = np.arange(len(angles)) * scene.dt
-    speed = bvh.toe_speed(clip)
+    speed = skeleton.toe_speed(clip)
     toe = np.interp(times, np.arange(len(speed)) / clip.rate, speed)
-    return _kick(path.stem, scene.bodies[0], angles, toe, round(bvh.strike(clip) / clip.rate / scene.dt), scene.dt)
+    return _kick(path.stem, scene.bodies[0], angles, toe, round(skeleton.strike(clip) / clip.rate / scene.dt), scene.dt)
 
 
 def table(kicks: list[Kick]) -> Table:

@@ -1,0 +1,160 @@
+"""Motions given as joint angles of our own human, from Python or from an npz file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+from zipfile import BadZipFile
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from larp_model.bodies import human
+from larp_model.scene import Body, Vector, anchor
+from tasks.motions.skeleton import LIMBS, SIDES, Motion
+
+FIELDS = ("rate", "position", "orientation", "angles")
+RATES = (10.0, 1000.0)
+
+
+class _Joint(NamedTuple):
+    """A joint: the link that it carries, its parent's row, its place in the parent's link [m], its turn to a T-pose."""
+
+    name: str
+    link: int
+    parent: int
+    offset: np.ndarray
+    turn: Rotation
+
+
+def load(path: str | Path) -> Motion:
+    """The motion of an npz file with the arguments of `motion` by their names; joints (J,) may be left out."""
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"path is {str(path)!r}, but no such file exists")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            given = dict(file)
+    except (ValueError, OSError, EOFError, BadZipFile):
+        raise ValueError(f"{path.name} is no npz file of numbers and names") from None
+    if missing := [name for name in FIELDS if name not in given]:
+        raise ValueError(f"{path.name} has no {', '.join(missing)}: it needs {', '.join(FIELDS)}")
+    names = given.get("joints")
+    joints = None if names is None else [str(name) for name in np.atleast_1d(names)]
+    try:
+        return motion(given["rate"], given["position"], given["orientation"], given["angles"], joints)
+    except ValueError as error:
+        raise ValueError(f"{path.name}: {error}") from None
+
+
+def motion(
+    rate: float | np.ndarray,
+    position: np.ndarray,
+    orientation: np.ndarray,
+    angles: np.ndarray,
+    joints: list[str] | None = None,
+) -> Motion:
+    """The motion of our human of 1.75 m, by forward kinematics; `skeleton.retarget` gives its angles back.
+
+    rate: frames a second. position: of the pelvis (T, 3) [m], world frame, z up. orientation: of the pelvis (T, 4), w,
+    x, y, z. angles: (T, J, 3) rotation vectors [rad] of the child links' joints, from their parents, in the order of
+    the human's motors or of `joints`, which names the child links. All zero, it stands upright with hanging arms.
+    ValueError where an argument is not of that kind.
+    """
+    body = human()
+    names = [body.links[child].name for child, _, _ in body.motors]
+    rate, position, orientation, angles = (np.asarray(each, float) for each in (rate, position, orientation, angles))
+    frames, count = len(position) if position.ndim else 0, len(names)
+    for name, value, shape in (
+        ("rate", rate, ()),
+        ("position", position, (frames, 3)),
+        ("orientation", orientation, (frames, 4)),
+        ("angles", angles, (frames, count, 3)),
+    ):
+        if value.shape != shape or not frames:
+            wanted = {"rate": "()", "position": "(T, 3)", "orientation": "(T, 4)", "angles": f"(T, {count}, 3)"}[name]
+            raise ValueError(f"{name} has shape {value.shape}, but needs {wanted}, the same T in all")
+        if not np.isfinite(value).all():
+            raise ValueError(f"{name} holds numbers that are not finite")
+    if not RATES[0] <= rate <= RATES[1]:
+        raise ValueError(f"rate is {rate:g}, but must be from {RATES[0]:g} to {RATES[1]:g} frames a second")
+    if abs(np.linalg.norm(orientation, axis=-1) - 1.0).max() > 1e-3:
+        raise ValueError("orientation holds quaternions that are not of length 1")
+    if joints is not None:
+        if sorted(joints) != sorted(names):
+            raise ValueError(f"joints are {', '.join(joints)}, but must be {', '.join(names)}, in any order")
+        angles = angles[:, [joints.index(name) for name in names]]
+    return _of_links(body, float(rate), position, _link_rotations(body, orientation, angles))
+
+
+def _anchor(body: Body, point: Vector, link: int) -> np.ndarray:
+    """Where a joint's anchor (3,) [m] is in the frame of a link of the body."""
+    length, radius, _ = body.sizes[link]
+    return anchor(point, np.array(length), np.array(radius), body.links[link].axis)
+
+
+def _link_rotations(body: Body, orientation: np.ndarray, angles: np.ndarray) -> list[Rotation]:
+    """World orientations of the links in all frames."""
+    motors = {child: row for row, (child, _, _) in enumerate(body.motors)}
+    found = [Rotation.from_quat(orientation, scalar_first=True)]
+    for child, joint in enumerate(body.joints, start=1):
+        found.append(found[joint.parent] * Rotation.from_rotvec(angles[:, motors[child]]))
+    return found
+
+
+def _of_links(body: Body, rate: float, position: np.ndarray, turned: list[Rotation]) -> Motion:
+    """The motion with joints where the human's are, their frames parallel to the world's in a T-pose."""
+    level = {  # which turns hanging arms to a T-pose's
+        side: Rotation.from_rotvec((0.5 * np.pi * (1.0 if side == "Left" else -1.0), 0.0, 0.0)) for side in SIDES
+    }
+    links = {link.name: row for row, link in enumerate(body.links)}
+    none = Rotation.identity()
+    rows = [_Joint("Hips", 0, -1, np.zeros(3), none)]
+    place = {"Hips": 0}
+
+    def add(name: str, link: int, parent: str, offset: np.ndarray, turn: Rotation) -> None:
+        place[name] = len(rows)
+        rows.append(_Joint(name, link, place[parent], offset, turn))
+
+    def between(link: int) -> np.ndarray:
+        """From the parent's joint to the link's own, in the parent link's frame."""
+        joint = body.joints[link - 1]
+        begin = _anchor(body, body.joints[joint.parent - 1].child_anchor, joint.parent) if joint.parent else np.zeros(3)
+        return _anchor(body, joint.parent_anchor, joint.parent) - begin
+
+    def tip(link: int, along: np.ndarray) -> np.ndarray:
+        """From the link's joint to one end of its axis, in its frame."""
+        size = body.links[link].length
+        return 0.5 * size * along - _anchor(body, body.joints[link - 1].child_anchor, link)
+
+    add("Spine", links["torso"], "Hips", between(links["torso"]), none)
+    add("Head", links["head"], "Spine", between(links["head"]), none)
+    for side in SIDES:
+        parents = {
+            "Arm": "Spine",
+            "ForeArm": f"{side}Arm",
+            "UpLeg": "Hips",
+            "Leg": f"{side}UpLeg",
+            "Foot": f"{side}Leg",
+        }
+        for segment, name in LIMBS.items():
+            link, turn = links[f"{side.lower()}_{segment}"], level[side] if "arm" in segment else none
+            add(side + name, link, parents[name], between(link), turn)
+            if name == "ForeArm":
+                add(f"{side}Hand", link, side + name, tip(link, np.array([0.0, 0.0, -1.0])), turn)
+            if name == "Foot":
+                add(f"{side}ToeBase", link, side + name, tip(link, np.array([1.0, 0.0, 0.0])), turn)
+    positions, offsets = [position], [np.zeros(3)]
+    for joint in rows[1:]:
+        parent = rows[joint.parent]
+        positions.append(positions[joint.parent] + turned[parent.link].apply(joint.offset))
+        offsets.append(parent.turn.apply(joint.offset))
+    orientations = [(turned[joint.link] * joint.turn.inv()).as_quat(scalar_first=True) for joint in rows]
+    return Motion(
+        tuple(joint.name for joint in rows),
+        np.array([joint.parent for joint in rows]),
+        np.array(offsets),
+        rate,
+        np.stack(positions, axis=1),
+        np.stack(orientations, axis=1),
+    )

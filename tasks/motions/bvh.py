@@ -1,0 +1,254 @@
+"""BVH files, read strictly as captured motions.
+
+A BVH file is a tree of joints with offsets and, for every frame, the angles of all joints (M. Meredith and S. Maddock,
+"Motion capture file formats explained", 2001). Here its joints go by MotionBuilder's names, as in B. Hahne's conversion
+of the Carnegie Mellon motion capture database; a table for each other skeleton says what its files call them. Files
+have y up and face z; here z is up, x forward and y left.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+from textwrap import shorten
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tasks.motions.rest_pose import resting
+from tasks.motions.skeleton import NEEDED, SIDES, Motion, bone, facing, is_t_pose
+
+# The bones of the Carnegie Mellon database's own ASF files, each named at the joint where it begins.
+BONES = {
+    "Arm": "humerus",
+    "ForeArm": "radius",
+    "Hand": "wrist",
+    "UpLeg": "femur",
+    "Leg": "tibia",
+    "Foot": "foot",
+    "ToeBase": "toes",
+}
+ASF = {"Head": "head", **{side + name: side[0].lower() + bone for side in SIDES for name, bone in BONES.items()}}
+# What the files of each known skeleton call the joints that we need; Mixamo's names are MotionBuilder's, prefixed.
+SKELETONS = {
+    "MotionBuilder": {name: name for name in NEEDED},
+    "LAFAN1": {name: name.replace("ToeBase", "Toe") for name in NEEDED},
+    "ASF": {"Hips": "root", **ASF},
+}
+# Metres in one unit of a file: the Carnegie Mellon conversions', a centimetre, a metre. The length of the legs decides.
+UNITS = (0.0254 / 0.45, 0.01, 1.0)
+LEG_LENGTH = (0.6, 1.2)
+_OURS = {"X": "Y", "Y": "Z", "Z": "X"}  # a file's axes in our words; positions are reordered accordingly
+_TO_OURS = [2, 0, 1]
+_LARGEST = 1e6
+_PREFIX = re.compile(r"^(.*:|mixamorig\d*_)")  # of a whole skeleton, as in mixamorig:Hips
+
+
+def load(path: str | Path, names: Mapping[str, str] | None = None) -> Motion:
+    """Read a BVH file; ValueError, in one line, says what is missing, damaged or not understood.
+
+    names: what the file calls the joints of `NEEDED`, {"Hips": "pelvis", ...}; those left out go by our names. By
+    default, the table of `SKELETONS` that fits the file best. Prefixes, as in mixamorig:Hips, are left out. The rest
+    pose is the first frame if that is a T-pose, which is then left out, else the pose without rotations if that is
+    one, else what `rest_pose` makes of the frames.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"path is {str(path)!r}, but no such file exists")
+    tables = list(SKELETONS.values()) if names is None else [_table(names)]
+    try:
+        joints, duration, data = _parse(path.read_bytes().decode("ascii", "replace").splitlines())
+        return _motion(_named(joints, tables), duration, data)
+    except ValueError as error:
+        raise ValueError(f"{path.name} {error}") from None
+
+
+def names_in(path: Path) -> dict[str, str]:
+    """The table of names that a JSON file holds, for `load`."""
+    if not path.is_file():
+        raise ValueError(f"names is {str(path)!r}, but no such file exists")
+    try:
+        found = json.loads(path.read_bytes())
+    except ValueError:
+        raise ValueError(f"names: {path.name} is no JSON file") from None
+    if not (isinstance(found, dict) and all(isinstance(each, str) for each in found.values())):
+        raise ValueError(f'names: {path.name} needs an object such as {{"Hips": "pelvis", "LeftLeg": "l_knee"}}')
+    return found
+
+
+def _table(names: Mapping[str, str]) -> dict[str, str]:
+    """A user's table, made whole; ValueError where it names joints that are not ours, or one joint twice."""
+    if unknown := [str(name) for name in names if name not in NEEDED]:
+        raise ValueError(f"names has {', '.join(unknown)}, but needs a file's names of {', '.join(NEEDED)}")
+    table = {name: _PREFIX.sub("", names.get(name, name)) for name in NEEDED}
+    if len(set(table.values())) < len(table):
+        twice = next(theirs for theirs in table.values() if list(table.values()).count(theirs) > 1)
+        ours = " and ".join(name for name, theirs in table.items() if theirs == twice)
+        raise ValueError(f"names has {twice!r} for {ours}, but needs another joint for each")
+    return table
+
+
+@dataclass(frozen=True)
+class _Joint:
+    name: str
+    parent: int
+    offset: list[float]
+    channels: list[str]
+
+
+def _parse(lines: list[str]) -> tuple[list[_Joint], float, np.ndarray]:
+    """Joints, seconds a frame and channels (T, C) of a file, in its own unit and axes."""
+    rows = [(number, line.split()) for number, line in enumerate(lines, start=1) if line.strip()]
+    start = next((index for index, (_, words) in enumerate(rows) if words == ["MOTION"]), None)
+    if start is None or rows[0][1] != ["HIERARCHY"]:
+        raise ValueError("is no BVH file: it needs a line HIERARCHY first and a line MOTION later")
+    joints = _hierarchy(word for _, words in rows[1:start] for word in words)
+    match [words for _, words in rows[start + 1 : start + 3]]:
+        case [["Frames:", count], ["Frame", "Time:", seconds]] if count.isdecimal():
+            (duration,) = _numbers([seconds], 1, "has a Frame Time that")
+        case _:
+            raise ValueError("has no frames: it needs lines 'Frames: N' and 'Frame Time: SECONDS' after MOTION")
+    if not 0.0 < duration <= 0.1:
+        raise ValueError(f"has a Frame Time of {duration:g} s, but needs one above 0 and up to 0.1 s")
+    columns = sum(len(joint.channels) for joint in joints)
+    data = [_numbers(words, columns, f"has a line, {number}, that") for number, words in rows[start + 3 :]]
+    if not data or len(data) != int(count):
+        raise ValueError(f"has {len(data) or 'no'} frames, but announces {count[:9]}")
+    return joints, duration, np.array(data)
+
+
+def _numbers(words: list[str], count: int, place: str) -> list[float]:
+    if len(words) != count:
+        raise ValueError(f"{place} has {len(words)} columns, but needs {count}")
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        raise ValueError(f"{place} holds something that is not a number") from None
+    if not all(abs(value) < _LARGEST for value in values):
+        raise ValueError(f"{place} holds a number that is not finite, or not below {_LARGEST:g}")
+    return values
+
+
+def _hierarchy(words: Iterator[str]) -> list[_Joint]:
+    """The tree of joints, parents first. The ends of bones that carry no joint are read and left out."""
+    joints: list[_Joint] = []
+    line: list[int] = []
+
+    def need(*wanted: str) -> None:
+        for word in wanted:
+            if (found := next(words, "its end")) != word:
+                raise ValueError(f"has {found[:40]!r} in its HIERARCHY, but needs {word!r} there")
+
+    for word in words:
+        if word == "}" and line:
+            line.pop()
+        elif word == "End" and line:
+            need("Site", "{", "OFFSET")
+            _numbers(list(islice(words, 3)), 3, "has an End Site that")
+            need("}")
+        elif word == ("JOINT" if line else "ROOT") and (line or not joints):
+            name = _PREFIX.sub("", next(words, ""))
+            need("{", "OFFSET")
+            offset = _numbers(list(islice(words, 3)), 3, f"has a joint, {name}, that")
+            need("CHANNELS")
+            count = next(words, "")
+            kinds = ("rotation",) if line and count != "6" else ("position", "rotation")
+            wanted = [axis + kind for kind in kinds for axis in "XYZ"]
+            channels = list(islice(words, len(wanted)))
+            if count != str(len(wanted)) or sorted(channels) != sorted(wanted):
+                raise ValueError(f"has a joint, {name}, with other channels than {', '.join(wanted)}, each once")
+            joints.append(_Joint(name, line[-1] if line else -1, offset, channels))
+            line.append(len(joints) - 1)
+        else:
+            raise ValueError(f"has {word[:40]!r} in its HIERARCHY, where it does not belong")
+    names = [joint.name for joint in joints]
+    if line or len(set(names)) != len(names):
+        raise ValueError("has a HIERARCHY with " + ("braces left open" if line else "two joints of one name"))
+    return joints
+
+
+def _named(joints: list[_Joint], tables: list[dict[str, str]]) -> list[_Joint]:
+    """The joints, those that we need under our names, by the first table that leaves the fewest of them out."""
+    found = [joint.name for joint in joints]
+    table = min(tables, key=lambda table: len(set(table.values()) - set(found)))
+    if missing := {ours: theirs for ours, theirs in table.items() if theirs not in found}:
+        raise ValueError(
+            f"has no joints {', '.join(missing.values())}, but needs them, or names that say what it calls"
+            f" {', '.join(missing)}: it has {shorten(', '.join(found), 600)}"
+        )
+    ours = {theirs: name for name, theirs in table.items()}
+    # Another joint of the file may go by a name that is ours.
+    return [
+        replace(joint, name=ours.get(joint.name, f"{joint.name} (other)" if joint.name in NEEDED else joint.name))
+        for joint in joints
+    ]
+
+
+def _motion(joints: list[_Joint], duration: float, data: np.ndarray) -> Motion:
+    """The motion of all frames, in metres, the joints' frames made parallel in the rest pose."""
+    poses = np.concatenate([_unturned(joints)[None], data])
+    raw = _posed(joints, duration, poses)
+    thighs, shins = ([bone(raw, side + joint)[0] for side in SIDES] for joint in ("UpLeg", "Leg"))
+    legs = float(np.linalg.norm(thighs, axis=-1).mean() + np.linalg.norm(shins, axis=-1).mean())
+    unit = next((unit for unit in UNITS if LEG_LENGTH[0] <= unit * legs <= LEG_LENGTH[1]), None)
+    if unit is None:
+        raise ValueError(f"has legs {legs:.3g} units long, but needs 0.6 to 1.2 m in units of 0.0254/0.45 m, cm or m")
+    if raw.chest == raw.names[0]:
+        raise ValueError("has no chest: its arms branch off the root")
+    rest = next((pose for pose in (1, 0) if is_t_pose(raw, pose)), None)
+    if rest is None:
+        turns, rest = resting(raw.cut(1, len(poses))), 0
+    else:
+        turns = facing(raw, rest) * Rotation.from_quat(raw.orientations[rest], scalar_first=True)
+    if len(poses) == 1 + rest:
+        raise ValueError("has no frames but the T-pose")
+
+    offsets = np.zeros_like(raw.offsets)
+    offsets[1:] = turns[raw.parents[1:]].apply(raw.offsets[1:])
+    moved = Rotation.from_quat(raw.orientations[1 + rest :].reshape(-1, 4), scalar_first=True)
+    frames = len(poses) - 1 - rest
+    back = Rotation.concatenate([turns.inv()] * frames)
+    orientations = (moved * back).as_quat(scalar_first=True).reshape(frames, -1, 4)
+    return replace(raw, offsets=unit * offsets, positions=unit * raw.positions[1 + rest :], orientations=orientations)
+
+
+def _unturned(joints: list[_Joint]) -> np.ndarray:
+    """The channels (C,) of the pose without rotations; joints that have positions are where their offsets say."""
+    found = []
+    for joint in joints:
+        offset = dict(zip("XYZ", joint.offset if joint.parent >= 0 else (0.0, 0.0, 0.0), strict=True))
+        found += [offset[channel[0]] if channel.endswith("position") else 0.0 for channel in joint.channels]
+    return np.array(found)
+
+
+def _posed(joints: list[_Joint], duration: float, poses: np.ndarray) -> Motion:
+    """Forward kinematics of the channels (P, C), in our axes but the file's unit and joint frames."""
+    turns: list[Rotation] = []
+    places: list[np.ndarray] = []
+    column = 0
+    for joint in joints:
+        channels = dict(zip(joint.channels, poses.T[column : column + len(joint.channels)], strict=True))
+        column += len(joint.channels)
+        order = [channel for channel in joint.channels if channel.endswith("rotation")]
+        angles = np.stack([channels[channel] for channel in order], axis=-1)
+        turn = Rotation.from_euler("".join(_OURS[channel[0]] for channel in order), angles, degrees=True)
+        offset = np.array(joint.offset)[_TO_OURS]
+        place = np.stack([channels[f"{axis}position"] for axis in "ZXY"], axis=-1) if len(channels) > 3 else offset
+        if joint.parent < 0:
+            places.append(offset + place)
+            turns.append(turn)
+        else:
+            places.append(places[joint.parent] + turns[joint.parent].apply(place))
+            turns.append(turns[joint.parent] * turn)
+    return Motion(
+        tuple(joint.name for joint in joints),
+        np.array([joint.parent for joint in joints]),
+        np.array([joint.offset for joint in joints])[:, _TO_OURS],
+        1.0 / duration,
+        np.stack(places, axis=1),
+        np.stack([turn.as_quat(scalar_first=True) for turn in turns], axis=1),
+    )

@@ -1,0 +1,177 @@
+"""Captured motions: joints over time, mirrored, judged, and retargeted to the human of 13 links."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.signal import savgol_filter
+from scipy.spatial.transform import Rotation, Slerp
+
+from larp_model.scene import Body
+
+SIDES = ("Left", "Right")
+# The joint that carries each segment; the torso's is where the arms branch off the spine.
+JOINTS = {"pelvis": "Hips", "head": "Head"}
+LIMBS = {"upper_arm": "Arm", "lower_arm": "ForeArm", "thigh": "UpLeg", "shin": "Leg", "foot": "Foot"}
+# Where a limb's bone ends; in the human's rest pose these bones hang straight down.
+ENDS = {"Arm": "ForeArm", "ForeArm": "Hand", "UpLeg": "Leg", "Leg": "Foot"}
+NEEDED = [*JOINTS.values(), *(side + name for side in SIDES for name in (*LIMBS.values(), "Hand", "ToeBase"))]
+# How far the arms and legs of a T-pose may be from level and upright [rad].
+T_POSE = 0.6
+# Frames over which a speed is fitted.
+SMOOTHING = 5
+# The toes of captured kicks reach 11 m/s and more, those of people who walk 4 or 5 m/s.
+SLOWEST_KICK = 6.0
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A captured motion of n joints over T frames, in the world frame.
+
+    As in a `Body`, all joint frames are parallel to the world's in the rest pose, in which the person faces x.
+    names: of the joints, parents first. parents: (n,), -1 for the root. offsets: (n, 3) from the parent's joint, in
+    the parent's frame [m], the root's being zero. rate: frames per second. positions: (T, n, 3) [m]. orientations:
+    (T, n, 4), w, x, y, z.
+    """
+
+    names: tuple[str, ...]
+    parents: np.ndarray
+    offsets: np.ndarray
+    rate: float
+    positions: np.ndarray
+    orientations: np.ndarray
+
+    def path(self, name: str) -> np.ndarray:
+        """Where a joint is (T, 3) [m]."""
+        return self.positions[:, self.names.index(name)]
+
+    def rotation(self, name: str) -> Rotation:
+        """How a joint's frame is turned in each of the T frames."""
+        return Rotation.from_quat(self.orientations[:, self.names.index(name)], scalar_first=True)
+
+    def cut(self, first: int, last: int) -> Motion:
+        """The frames from `first` to `last`, both included, or what there is of them."""
+        frames = slice(max(first, 0), last + 1)
+        return replace(self, positions=self.positions[frames], orientations=self.orientations[frames])
+
+    @property
+    def hip_height(self) -> float:
+        """Of the hips above the toes' base in the rest pose [m]."""
+        hips, toes = (self.offsets[self._lineage(joint), 2].sum() for joint in ("Hips", "LeftToeBase"))
+        return float(hips - toes)
+
+    @property
+    def chest(self) -> str:
+        """The joint at which the arms branch off the spine."""
+        left, right = self._lineage("LeftArm"), self._lineage("RightArm")
+        return self.names[next(joint for joint in left if joint in right)]
+
+    def _lineage(self, name: str) -> list[int]:
+        """A joint, its parent and so on, up to the root."""
+        line = [self.names.index(name)]
+        while line[-1] > 0:
+            line.append(int(self.parents[line[-1]]))
+        return line
+
+
+def bone(motion: Motion, joint: str) -> np.ndarray:
+    """From a limb's joint to the end of its bone (T, 3) [m]."""
+    side = next(side for side in SIDES if joint.startswith(side))
+    return motion.path(side + ENDS[joint.removeprefix(side)]) - motion.path(joint)
+
+
+def facing(motion: Motion, frame: int) -> Rotation:
+    """The turn about z that makes the person face x."""
+    x, y, _ = (motion.path("LeftUpLeg") - motion.path("RightUpLeg"))[frame]
+    return Rotation.from_rotvec((0.0, 0.0, np.arctan2(x, y)))
+
+
+def is_t_pose(motion: Motion, frame: int) -> bool:
+    straight = facing(motion, frame)
+    for side, outwards in zip(SIDES, (1.0, -1.0), strict=True):
+        for joint in ENDS:
+            along = straight.apply(bone(motion, side + joint)[frame])
+            wanted = np.array((0.0, 0.0, -1.0) if "Leg" in joint else (0.0, outwards, 0.0))
+            if not along @ wanted > np.cos(T_POSE) * np.linalg.norm(along):
+                return False
+    return True
+
+
+def mirrored(motion: Motion) -> Motion:
+    """The motion in a mirror, the plane y = 0: left and right change places."""
+    other = {"Left": "Right", "Right": "Left", "L": "R", "R": "L", "l": "r", "r": "l"}
+    opposite = [re.sub("^(Left|Right|[LRlr])", lambda side: other[side[1]], name) for name in motion.names]
+    return replace(
+        motion,
+        names=tuple(new if new in motion.names else name for name, new in zip(motion.names, opposite, strict=True)),
+        offsets=motion.offsets * (1.0, -1.0, 1.0),
+        positions=motion.positions * (1.0, -1.0, 1.0),
+        orientations=motion.orientations * (1.0, -1.0, 1.0, -1.0),
+    )
+
+
+def retarget(motion: Motion, body: Body, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """The motion as poses of our human, every `dt` [s].
+
+    Every link takes its joint's turn from the rest pose, on top of the turn that brings its bone from where it points
+    in the human's rest pose (limbs hang straight down) to where it points in the clip's (arms level). So limbs point
+    as the clip's do, whatever the proportions, and twist as its joints do. Feet are flat in both rest poses.
+
+    Returns the root's orientation (T', 4), w, x, y, z, and the joints' rotation vectors (T', J, 3) [rad], within the
+    motors' bounds.
+    """
+    if not dt > 0.0 or len(motion.positions) < 2:
+        raise ValueError(
+            f"dt is {dt!r}, the motion has {len(motion.positions)} frames; needs dt above 0 and two frames"
+        )
+    times = np.arange(len(motion.positions)) / motion.rate
+    at = np.arange(int(times[-1] / dt + 1e-6) + 1) * dt
+    rotations = [Slerp(times, _link_rotation(motion, link.name))(np.minimum(at, times[-1])) for link in body.links]
+    controls = np.stack(
+        [(rotations[joint.parent].inv() * rotations[child]).as_rotvec() for child, joint, _ in body.motors], axis=1
+    )
+    lower, upper = (np.array([getattr(motor, bound) for _, _, motor in body.motors]) for bound in ("lower", "upper"))
+    return rotations[0].as_quat(scalar_first=True), np.clip(controls, lower, upper)
+
+
+def _link_rotation(motion: Motion, link: str) -> Rotation:
+    """World orientations of the link in all frames."""
+    side, _, segment = link.partition("_")
+    if segment not in LIMBS:
+        if link != "torso" and link not in JOINTS:
+            raise ValueError(f"body has a link {link!r}, but captured motions move a human's links alone")
+        return motion.rotation(JOINTS.get(link, motion.chest))
+    joint = side.capitalize() + LIMBS[segment]
+    turned = motion.rotation(joint)
+    if LIMBS[segment] not in ENDS:
+        return turned
+    along = turned[0].inv().apply(bone(motion, joint)[0])
+    aligned, _ = Rotation.align_vectors([along], [(0.0, 0.0, -1.0)])
+    return turned * aligned
+
+
+def toe_velocity(motion: Motion, side: str) -> np.ndarray:
+    """Velocity (T, 3) [m/s] of the toes' base of one side, "Left" or "Right".
+
+    The slope of a parabola fitted to 5 frames (Savitzky and Golay), which evens out a marker that jumps in one frame.
+    """
+    if len(motion.positions) < SMOOTHING:
+        raise ValueError(f"motion has {len(motion.positions)} frames, but speeds need {SMOOTHING}")
+    return savgol_filter(motion.path(f"{side}ToeBase"), SMOOTHING, 2, deriv=1, delta=1.0 / motion.rate, axis=0)
+
+
+def kicking_side(motion: Motion) -> str:
+    """The side, "Left" or "Right", whose toes become faster."""
+    return max(reversed(SIDES), key=lambda side: np.linalg.norm(toe_velocity(motion, side), axis=-1).max())
+
+
+def toe_speed(motion: Motion) -> np.ndarray:
+    """Speed (T,) [m/s] of the kicking foot's toes' base, smoothed as in `toe_velocity`."""
+    return np.linalg.norm(toe_velocity(motion, kicking_side(motion)), axis=-1)
+
+
+def strike(motion: Motion) -> int:
+    """The frame in which the kicking toe is fastest."""
+    return int(toe_speed(motion).argmax())
