@@ -135,6 +135,17 @@ def test_orientations_stay_of_unit_length(simulator: Simulator, kicks: tuple[np.
     np.testing.assert_allclose(np.linalg.norm(after[..., packed.ORIENTATION], axis=-1), 1.0, atol=1e-12)
 
 
+def test_the_ground_never_speeds_up_a_balls_spin_about_the_vertical(
+    compact_simulator: Simulator, kicks: tuple[np.ndarray, np.ndarray]
+) -> None:
+    states, controls = kicks[0].copy(), kicks[1]
+    states[:, -1, packed.POSITION] = 30.0, 0.0, 0.11
+    states[:, -1, packed.VELOCITY] = 0.0
+    states[:, -1, packed.ANGULAR_VELOCITY] = np.random.default_rng(0).normal(0.0, 80.0, (len(states), 3))
+    spin = np.abs(np.concatenate([states[:, None], roll(compact_simulator, states, controls)], axis=1)[:, :, -1, 12])
+    assert (np.diff(spin, axis=1) <= 1e-9).all()
+
+
 def test_a_ball_far_from_everything_flies_exactly(
     compact_simulator: Simulator, kicks: tuple[np.ndarray, np.ndarray]
 ) -> None:

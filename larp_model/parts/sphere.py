@@ -83,7 +83,8 @@ class Sphere:
         new_velocity = velocity - self.gravity * dt * up + kick + bounce * up + slide
         moment = (impulse[:, 3:] + dt * torque) / (SPHERE * mass * radius**2)
         rolling = (grip * jnp.cross(up, ground.slip) + roll * jnp.cross(up, along)) / (SPHERE * radius)
-        new_spin = spin + moment + rolling - twist * spin * up
+        # What a network does not know it must not drive: the ground may slow a spin about the vertical, no more.
+        new_spin = spin + moment + rolling - jnp.maximum(twist, 0.0) * spin * up
         moved = (
             velocity * dt
             - 0.5 * self.gravity * dt**2 * up
