@@ -16,7 +16,7 @@ from larp_model.training import first_contacts
 from larp_model.truth.episodes import Episodes, record
 from larp_model.truth.mujoco import Truth, closed
 from tasks.motions.people import random_people
-from tasks.references import Reference, clearance, resting
+from tasks.motions.references import Reference, clearance, resting
 
 STEPS, CONTACT_STEPS = 70, 10
 # How far random joint targets stray from the reference, standard deviation by segment [rad]; the planner's too.

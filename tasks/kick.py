@@ -52,12 +52,13 @@ from mpc import (
     quadratic,
 )
 from mpc.loop import Execution, Phase, Replan, Window, execute
-from tasks import references, residuals
+from tasks import residuals
 from tasks.data import stray
 from tasks.gap import contact_step, gap, told
+from tasks.motions import references
 from tasks.motions.bvh import names_in
+from tasks.motions.references import Reference
 from tasks.presets import Preset, preset_of, usable
-from tasks.references import Reference
 from tasks.scenarios import ANY_HUMAN
 from tasks.standing import Standing
 from viewer import LivePage, Recording, kick_picture, nearest_approach, write_html

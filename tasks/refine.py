@@ -23,11 +23,11 @@ from larp_model.bodies import human_and_ball, standing_height
 from larp_model.files import write_whole
 from larp_model.scene import Scene
 from larp_model.truth.mujoco import Truth
-from tasks import key_poses
 from tasks.data import SHIFT, smooth_noise, stray
-from tasks.key_poses import KeyPoses
 from tasks.kick import run
-from tasks.references import starts
+from tasks.motions import key_poses
+from tasks.motions.key_poses import KeyPoses
+from tasks.motions.references import starts
 
 # What a kick should be: launch and toe speed [m/s], elevation of the launch [rad], earliest and latest step of the
 # strike, clearance of the toes before it [m], and how long it is watched [steps].

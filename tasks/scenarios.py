@@ -11,8 +11,8 @@ from larp_model.bodies import chain, human_and_ball, human_and_capsule, two_ball
 from larp_model.designs import DesignName, SizeName
 from larp_model.scene import Scene
 from larp_model.truth.episodes import Episodes
-from tasks import references
 from tasks.data import WINDOWS, random_episodes
+from tasks.motions import references
 from tasks.motions.generator import any_episodes
 from tasks.thrown import thrown_episodes
 

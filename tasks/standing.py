@@ -29,8 +29,8 @@ from mpc import CostTerm, Dynamics, Optimizer, Planner, quadratic
 from mpc.loop import Window
 from tasks import residuals
 from tasks.data import stray
+from tasks.motions.references import Reference
 from tasks.presets import usable
-from tasks.references import Reference
 
 HORIZON = 50
 KNOTS = 6

@@ -10,7 +10,7 @@ from larp_model.scene import Scene
 from larp_model.truth.episodes import Episodes, record
 from larp_model.truth.mujoco import Truth, closed
 from tasks.data import overlaps
-from tasks.references import clearance
+from tasks.motions.references import clearance
 
 STEPS = 200
 # Bodies meet so long after the start [s], so high above the ground [m], so far off each other's middle [m].

@@ -15,7 +15,7 @@ from larp_model.scene import Scene
 from larp_model.training import Recipe, Windows, statistics_of
 from larp_model.truth.episodes import Episodes
 from tasks.data import random_episodes
-from tasks.references import Reference, embedded
+from tasks.motions.references import Reference, embedded
 
 # The first example of a property pays for compilation: no deadline. Every run tries the same examples.
 settings.register_profile("repeatable", deadline=None, derandomize=True)

@@ -14,7 +14,7 @@ from mpc import evaluate
 from tasks import kick, sensing
 from tasks.data import random_roll
 from tasks.gap import contact_step, events, gap
-from tasks.references import standing_on_ground
+from tasks.motions.references import standing_on_ground
 from tasks.standing import HORIZON, SWUNG, Standing
 
 

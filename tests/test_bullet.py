@@ -17,7 +17,7 @@ from larp_model.truth.bullet import BulletTruth, give, inertia
 from larp_model.truth.mujoco import Truth, compile_model
 from tasks.benchmarks.model import second_opinion
 from tasks.data import smooth_noise, stray
-from tasks.references import Reference, standing_on_ground
+from tasks.motions.references import Reference, standing_on_ground
 from tasks.thrown import thrown_episodes
 
 MISSING = "pybullet is not installed: pip install 'larp-mpc[bullet]'"

@@ -16,7 +16,7 @@ from larp_model.bodies import human
 from larp_model.scene import Scene
 from tasks.benchmarks import reference as benchmark
 from tasks.motions import bvh, skeleton
-from tasks.references import captured
+from tasks.motions.references import captured
 
 CLIPS = Path(__file__).parents[2] / "shared" / "mocap"
 with_clips = pytest.mark.skipif(not CLIPS.is_dir(), reason="no captured clips in ../shared/mocap")

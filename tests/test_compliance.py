@@ -17,7 +17,7 @@ from larp_model.kinematics import morphology_of
 from larp_model.meeting import rows_of
 from larp_model.scene import Body, Scene
 from larp_model.truth.mujoco import Truth, compile_model
-from tasks.references import Reference
+from tasks.motions.references import Reference
 
 
 def loose_chain(links: int) -> Scene:

@@ -13,8 +13,9 @@ from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.bodies import human_and_ball, standing_height
 from mpc import CEM
-from tasks import kick, references
+from tasks import kick
 from tasks.data import random_task
+from tasks.motions import references
 from tasks.presets import PRESETS, Preset, preset_of
 
 PROTOCOL = {

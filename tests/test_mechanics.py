@@ -21,7 +21,7 @@ from larp_model.compliance import moments
 from larp_model.mechanics import GAMMA, Constants, Motion, free_motion, impulse_response
 from larp_model.scene import Body, Scene
 from larp_model.truth.mujoco import Truth, closed, compile_model
-from tasks.references import standing_on_ground
+from tasks.motions.references import standing_on_ground
 from tasks.thrown import thrown_episodes, thrown_starts
 
 BODIES = (capsule(), chain(links=2), chain(links=4), human())

@@ -9,11 +9,10 @@ from larp_model import state as packed
 from larp_model.bodies import human, human_and_ball
 from larp_model.training import first_contacts
 from larp_model.truth.mujoco import Truth
-from tasks import references
-from tasks.motions import styles
+from tasks.motions import references, styles
 from tasks.motions.generator import any_episodes, in_motion, planted
 from tasks.motions.people import BUILD, HEIGHT, MASS, VARIED, random_people
-from tasks.references import clearance
+from tasks.motions.references import clearance
 
 SCENE = human_and_ball()
 ROWS = SCENE.rows("human")

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from larp_model.scene import Scene
-from tasks import key_poses, refine
-from tasks.references import Reference
+from tasks import refine
+from tasks.motions import key_poses
+from tasks.motions.references import Reference
 
 
 def test_key_poses_survive_their_file(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from larp_model.truth.episodes import Episodes
 from tasks import train
 from tasks.benchmarks import model
 from tasks.data import overlaps, resting
-from tasks.references import clearance
+from tasks.motions.references import clearance
 from tasks.scenarios import SCENARIOS, around, scenario
 
 COUNT = 32

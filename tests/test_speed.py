@@ -15,7 +15,7 @@ from larp_model.scene import Scene
 from larp_model.truth.mujoco import Truth
 from tasks.benchmarks import engines, replays, report, speed
 from tasks.benchmarks.engines import Course, Question, Refused
-from tasks.references import Reference
+from tasks.motions.references import Reference
 
 
 def asked(engine: str = "mujoco", scene: str = "ball", reach: str | None = None, batch: int = 2) -> Question:

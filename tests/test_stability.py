@@ -21,7 +21,7 @@ from larp_model.truth.mujoco import Truth
 from mpc import CEM, Gradient
 from mpc.loop import Diverged, Phase, Window, execute
 from tasks.benchmarks import pushes, slopes, stability
-from tasks.references import Reference
+from tasks.motions.references import Reference
 
 
 @pytest.fixture(autouse=True)

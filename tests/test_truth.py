@@ -20,7 +20,7 @@ from larp_model.training import first_contacts
 from larp_model.truth.episodes import VERSION, Episodes, join, load, record, save
 from larp_model.truth.mujoco import SUBSTEPS, Truth, compile_model
 from tasks.data import smooth_noise, stray
-from tasks.references import Reference, standing_on_ground
+from tasks.motions.references import Reference, standing_on_ground
 
 
 @pytest.fixture(autouse=True)

@@ -32,7 +32,7 @@ from larp_model.simulator import Simulator
 from larp_model.truth.mujoco import SUBSTEPS, Truth, compile_model
 from mpc.dynamics import BatchedTruth
 from tasks.benchmarks import report
-from tasks.references import embedded
+from tasks.motions.references import embedded
 
 # A row is the median of so many runs of so many steps, or of as many as fit into these seconds.
 STEPS, RUNS, SECONDS = 100, 5, 3.0

@@ -18,7 +18,7 @@ from larp_model.scene import Body, Scene
 from tasks.benchmarks import report
 from tasks.kick import run
 from tasks.motions import bvh, skeleton
-from tasks.references import Reference, embedded
+from tasks.motions.references import Reference, embedded
 
 # The part of a kick that is looked at, around its strike [s].
 BEFORE, AFTER = 0.6, 0.4

@@ -12,7 +12,7 @@ from larp_model.truth.mujoco import Truth, closed
 from tasks.data import STEPS, out_of_legs, pushes, random_places, smooth_noise, stray, turned_about_z
 from tasks.motions import styles
 from tasks.motions.people import random_people
-from tasks.references import Reference, clearance, standing_on_ground
+from tasks.motions.references import Reference, clearance, standing_on_ground
 
 # Shares of kicks and of walks; the rest moves from pose to pose.
 KICKS, GAITS = 0.45, 0.3

@@ -12,8 +12,8 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from larp_model import state as packed
 from larp_model.bodies import segment_of
 from larp_model.scene import Body
-from tasks import key_poses
 from tasks.data import STRAY
+from tasks.motions import key_poses
 
 
 def rows_of(body: Body) -> dict[str, int]:

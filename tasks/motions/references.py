@@ -14,11 +14,10 @@ from larp_model import state as packed
 from larp_model.bodies import standing_height
 from larp_model.scene import Body, Link, Scene
 from larp_model.truth.mujoco import Truth, closed, finite
-from tasks import key_poses
-from tasks.key_poses import KeyPoses
-from tasks.motions import angles, bvh, skeleton
+from tasks.motions import angles, bvh, key_poses, skeleton
+from tasks.motions.key_poses import KeyPoses
 from tasks.motions.skeleton import Motion
-from tasks.tracking import Tracker
+from tasks.motions.tracking import Tracker
 
 # Steps around the strike in which a captured kick may meet its ball.
 MEETING = 10
