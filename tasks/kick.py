@@ -447,6 +447,8 @@ def kick_of(
 ) -> Kick:
     """The kick of a scene's human, as `prepare` makes it."""
     if body_reference is None:
+        if names is not None:
+            raise ValueError(f"names is {str(names)!r}, but there is no reference whose joints they could be")
         return Kick(scene, references.embedded(scene), substeps)
     called = None if names is None else names_in(names)
     return Kick(scene, references.captured(body_reference, scene, names=called), substeps)

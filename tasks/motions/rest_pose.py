@@ -19,7 +19,7 @@ FRAMES, STRAIGHT = 10, 0.05
 def resting(motion: Motion) -> Rotation:
     """Orientations of the n joints' frames in a T-pose, the person facing x; `motion` in its file's joint frames.
 
-    Torso and pelvis have the mean lean of the motion, feet are as steep as when they are lowest, and all else (neck,
+    Torso and pelvis have the mean lean of the motion, feet are as steep as with the ankle lowest, and all else (neck,
     hands, ...) is turned to its parent as it is on average. ValueError where there are too few frames.
     """
     if len(motion.positions) < FRAMES:
@@ -68,9 +68,9 @@ def limb(motion: Motion, side: str, part: str, usual: Rotation) -> Rotation:
 
 
 def foot(motion: Motion, side: str, usual: Rotation) -> Rotation:
-    """The frame of a foot's joint, the foot as steep as it is when heel and toes together are lowest."""
-    ankle, toes = motion.path(f"{side}Foot"), motion.path(f"{side}ToeBase")
-    way, height = toes - ankle, (toes + ankle)[:, 2]
+    """The frame of a foot's joint, the foot as steep as it is when the ankle is lowest: toes are when they push off."""
+    ankle = motion.path(f"{side}Foot")
+    way, height = motion.path(f"{side}ToeBase") - ankle, ankle[:, 2]
     fall = np.median((-way[:, 2] / np.linalg.norm(way, axis=-1))[height <= np.quantile(height, 0.25)])
     fall = float(np.clip(fall, -0.9, 0.9))
     along = mean(motion.rotation(f"{side}Foot").inv(), way), np.sqrt(1.0 - fall**2) * FORWARDS - fall * UP
