@@ -53,6 +53,9 @@ bench: $(READY)
 	for scene in chains1 chains2; do $(MODEL) --scene $$scene --seed 2 --beside paper --bullet || exit; done
 	$(MODEL) --scene chain4 --seed 2 --bullet
 	$(MODEL) --scene human_capsule --seed 2
+	$(MODEL) --scene any_human --seed 2
+	$(MODEL) --scene human_ball --weights larp_model/weights/any_human.json --seed 2
+	$(MODEL) --scene human_ball --weights larp_model/weights/any_human.json --seed 2 --bodies varied
 	$(RUN) tasks.benchmarks.gap --targets 8 --seed 7 --publish
 	for preset in fast balanced accurate; do $(RUN) tasks.benchmarks.kick --publish --targets 64 --seed 11 --preset $$preset || exit; done
 	for preset in fast balanced accurate; do $(KICK) --targets 32 --preset $$preset --substeps 20 || exit; done
@@ -62,6 +65,7 @@ bench: $(READY)
 	$(KICK) --targets 32 --noise
 	$(KICK) --targets 32 --rolling 2
 	for height in 1.6 1.9; do $(KICK) --height $$height || exit; done
+	$(KICK) --targets 32 --bodies varied
 
 # Keeps runs/: results are never thrown away by a clean-up.
 clean:
