@@ -48,10 +48,31 @@ def compliance(
 ) -> Array:  # fmt: skip
     """Velocity gained per impulse, (B, P, 3, 3) [1/kg], by a point of each of P links of a body, in world axes.
 
-    rows: (P,) the links. matrices: (B, n, 3, 3) rotations of the body's links. points: (B, P, 3) [m] from the links'
-    centres. morphology (B or 1, n, 3). held: see `HELD`. chosen: (B, K, P) one-hot rows of the K links that points (B,
-    K, 3) are of; see `kinematics.picked`.
+    points: (B, P or K, 3) [m] from the links' centres. The rest is as in `yields`.
     """
+    return yielding(_links(body, rows, matrices, morphology, held, chosen), skew(points))
+
+
+def yields(
+    body: Body, rows: np.ndarray, matrices: Array, morphology: Array, held: float = HELD, chosen: Array | None = None
+) -> Array:
+    """Velocity and spin (B, P, 6, 6) gained by P links of a body per impulse and moment about their centres.
+
+    rows: (P,) the links. matrices: (B, n, 3, 3) rotations of the body's links. morphology (B or 1, n, 3). held: see
+    `HELD`. chosen: (B, K, P) one-hot rows of the K links that are asked for; see `kinematics.picked`.
+    """
+    lightness, inverse, arm, stiff = jnp.broadcast_arrays(*_links(body, rows, matrices, morphology, held, chosen))
+    zero, joint = jnp.zeros_like(inverse), jnp.concatenate([lightness, -arm @ inverse], axis=-1)
+    free = jnp.concatenate(
+        [jnp.concatenate([lightness, zero], axis=-1), jnp.concatenate([zero, inverse], axis=-1)], axis=-2
+    )
+    return free - jnp.swapaxes(joint, -1, -2) @ stiff @ joint
+
+
+def _links(
+    body: Body, rows: np.ndarray, matrices: Array, morphology: Array, held: float, chosen: Array | None
+) -> tuple[Array, Array, Array, Array]:
+    """Of the links 1/m, I^-1, and of their joints [j] and (G_jj + W_p)^-1, (B, P, 3, 3) each."""
     known: dict[int, tuple[Array, Array, Array, Array]] = {}
     stronger = strength(body, morphology)
     identity = jnp.eye(3, dtype=matrices.dtype)
@@ -83,7 +104,7 @@ def compliance(
     alone = [of(int(row)) for row in links]
     stacked = (jnp.stack(jnp.broadcast_arrays(*each), axis=-3)[:, places] for each in zip(*alone, strict=True))
     lightness, inverse, arm, stiff = (picked(each, chosen) for each in stacked)
-    return yielding((lightness, inverse, arm, stiff), skew(points))
+    return lightness, inverse, arm, stiff
 
 
 def yielding(link: tuple[Array, Array, Array, Array], point: Array) -> Array:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from larp_model.scene import Surface
+from larp_model.vector import Vector
 
 # The share of the constraint that is a spring; the rest follows the free motion (MuJoCo's impedance).
 IMPEDANCE = 0.99
@@ -70,13 +71,28 @@ def normalise(vector: Array, otherwise: Array) -> Array:
 
 
 def closest(first: Segment, second: Segment) -> Closest:
-    """Closest points of two capsules (C. Ericson, Real-Time Collision Detection, 5.1.9).
+    """Closest points of two capsules: see `nearest`."""
+    one, two = (Axis(Vector.of(each.centre), Vector.of(each.half), each.radius) for each in (first, second))
+    normal, distance, point, along = nearest(one, two)
+    return Closest(normal.array, distance, point.array, jnp.stack(along, axis=-1))
+
+
+class Axis(NamedTuple):
+    """A segment by its components."""
+
+    centre: Vector
+    half: Vector
+    radius: Array
+
+
+def nearest(first: Axis, second: Axis) -> tuple[Vector, Array, Vector, tuple[Array, Array]]:
+    """Closest points of two capsules (C. Ericson, Real-Time Collision Detection, 5.1.9), as in `Closest`.
 
     Where axes are parallel the middle of their overlap is taken; where they cross or coincide, the normal is z.
     """
     between = first.centre - second.centre
-    aa, bb = _dot(first.half, first.half), _dot(second.half, second.half)
-    ab, ac, bc = _dot(first.half, second.half), _dot(first.half, between), _dot(second.half, between)
+    aa, bb = first.half.dot(first.half), second.half.dot(second.half)
+    ab, ac, bc = first.half.dot(second.half), first.half.dot(between), second.half.dot(between)
     aa, bb = jnp.where(aa < 1e-12, 1.0, aa), jnp.where(bb < 1e-12, 1.0, bb)  # every place on a ball's axis is one
     determinant = aa * bb - ab * ab
     parallel = determinant < 1e-6 * aa * bb
@@ -89,13 +105,20 @@ def closest(first: Segment, second: Segment) -> Closest:
     s = jnp.where(parallel, middle, crossing)
     t = jnp.clip((ab * s + bc) / bb, -1.0, 1.0)
     s = jnp.where(parallel & (jnp.abs(t) < 1.0), s, jnp.clip((ab * t - ac) / aa, -1.0, 1.0))
-    on_first = first.centre + s[..., None] * first.half
-    on_second = second.centre + t[..., None] * second.half
+    on_first, on_second = first.centre + first.half * s, second.centre + second.half * t
     apart = on_second - on_first
-    normal = normalise(apart, jnp.array([0.0, 0.0, 1.0], apart.dtype))
-    distance = norm(apart) - first.radius - second.radius
-    point = 0.5 * (on_first + first.radius[..., None] * normal + on_second - second.radius[..., None] * normal)
-    return Closest(normal, distance, point, jnp.stack([s, t], axis=-1))
+    squared = apart.dot(apart)
+    zero = squared < 1e-20
+    length = jnp.sqrt(jnp.where(zero, 1.0, squared))
+    normal = Vector(
+        *(
+            jnp.where(zero, axis, each / length)
+            for axis, each in zip((0.0, 0.0, 1.0), (apart.x, apart.y, apart.z), strict=True)
+        )
+    )
+    distance = jnp.where(zero, 0.0, length) - first.radius - second.radius
+    point = (on_first + normal * first.radius + on_second - normal * second.radius) * 0.5
+    return normal, distance, point, (s, t)
 
 
 def moved(segment: Segment, velocity: Array, angular_velocity: Array, time: Array) -> Segment:

@@ -1,7 +1,7 @@
 """Which parts a simulator is made of, and how large their networks are.
 
 compact   everything that a body does is learned; the kick's
-hybrid    bodies move as mechanics says, and a network corrects it; the chains'
+hybrid    bodies move and press on each other as mechanics says, and networks correct that; all else's
 paper     the networks and sizes of the paper
 """
 
@@ -14,7 +14,9 @@ from typing import Literal
 from larp_model.networks import Size
 from larp_model.parts.articulated import Articulated, Base, Response
 from larp_model.parts.bases import FromNothing, OverMechanics
+from larp_model.parts.contact import Base as ContactBase
 from larp_model.parts.contact import Contact
+from larp_model.parts.impacts import FreeImpact, SoftContacts
 from larp_model.parts.paper import PaperBody, PaperContact
 from larp_model.parts.part import BodyPart, Model, PairPart, ordered
 from larp_model.parts.sphere import Sphere
@@ -45,12 +47,12 @@ SIZES: dict[SizeName, Sizes] = {
 
 def compact(scene: Scene, sizes: Sizes = COMPACT) -> Model:
     """The model that the kick is planned with."""
-    return _impulsive(scene, sizes, FromNothing())
+    return _impulsive(scene, sizes, FromNothing(), FreeImpact())
 
 
 def hybrid(scene: Scene, sizes: Sizes = SIZES["small"]) -> Model:
     """The model over mechanics."""
-    return _impulsive(scene, sizes, OverMechanics())
+    return _impulsive(scene, sizes, OverMechanics(), SoftContacts())
 
 
 def paper(scene: Scene, sizes: Sizes = PAPER) -> Model:
@@ -66,8 +68,8 @@ DesignName = Literal["compact", "hybrid", "paper"]
 DESIGNS: dict[DesignName, Callable[[Scene], Model]] = {"compact": compact, "hybrid": hybrid, "paper": paper}
 
 
-def _impulsive(scene: Scene, sizes: Sizes, base: Base) -> Model:
-    """Bodies on this base, and contacts that are impulses."""
+def _impulsive(scene: Scene, sizes: Sizes, base: Base, known: ContactBase) -> Model:
+    """Bodies and contacts that are impulses, on these bases."""
 
     def body_part(body: Body) -> BodyPart:
         if body.is_ball:
@@ -76,7 +78,9 @@ def _impulsive(scene: Scene, sizes: Sizes, base: Base) -> Model:
         response = Response(sizes.contact) if touched else None
         return Articulated(body, scene.dt, scene.gravity, base, sizes.body, response)
 
-    return _made(scene, body_part, lambda bodies, pair: Contact(bodies, pair, scene.dt, sizes.contact))
+    return _made(
+        scene, body_part, lambda bodies, pair: Contact(bodies, pair, scene.dt, scene.gravity, known, sizes.contact)
+    )
 
 
 def _made(

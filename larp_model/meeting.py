@@ -16,7 +16,7 @@ from jax import Array
 from larp_model import contact
 from larp_model import state as packed
 from larp_model.compliance import HELD, compliance
-from larp_model.contact import Closest, Impact, Segment
+from larp_model.contact import Closest, Segment
 from larp_model.kinematics import Kinematics, kinematics, picked
 from larp_model.scene import Body, Pair, Scene
 
@@ -26,12 +26,11 @@ class Constants:
     """What is chosen here, not derived.
 
     margin: links whose gap within a step is larger do not feel each other [m]. advances: Newton steps of conservative
-    advancement; three leave less than a millimetre at 10 m/s. impedance: see `contact.impact`. held: see `compliance`.
+    advancement; three leave less than a millimetre at 10 m/s. held: see `compliance`.
     """
 
     margin: float = 0.03
     advances: int = 3
-    impedance: float = contact.IMPEDANCE
     held: float = HELD
 
 
@@ -89,10 +88,10 @@ class Meeting(NamedTuple):
     """P pairs of links at the moment at which they meet in a step; vectors (B, P, 3) in the world frame.
 
     gap: (B, P) [m] when the step begins. lowest: the smallest seen [m]. near: 1 where the links touch within the step,
-    falling to 0 over the margin. remaining: (B, P) [s] of the step. normal: from the first to the second. relative:
-    velocity [m/s] of the first against the second, at the contact; approach (B, P) [m/s] along the normal, slide across
-    it. impact: along the normal. gained: of the relative velocity, in the step if nothing touches. arms: from either
-    link's centre to the contact [m]. centres: of both links [m]. given: velocity (B, P, 3) [m/s] between them per
+    falling to 0 over the margin. remaining: (B, P) [s] of the step. normal: from the first to the second. depth: (B, P)
+    [m] of penetration. relative: velocity [m/s] of the first against the second, at the contact; approach (B, P) [m/s]
+    along the normal, slide across it. gained: of the relative velocity, in the step if nothing touches. arms: from
+    either link's centre to the contact [m]. segments: both links. given: velocity (B, P, 3) [m/s] between them per
     impulse along the normal. mass: (B, P) effective mass [kg] along the normal, the links' parents included.
     """
 
@@ -101,13 +100,13 @@ class Meeting(NamedTuple):
     near: Array
     remaining: Array
     normal: Array
+    depth: Array
     relative: Array
     approach: Array
     slide: Array
-    impact: Impact
     gained: Array
     arms: tuple[Array, Array]
-    centres: tuple[Array, Array]
+    segments: tuple[Segment, Segment]
     given: Array
     mass: Array
 
@@ -115,7 +114,7 @@ class Meeting(NamedTuple):
         """The same as the second body sees it."""
         return self._replace(
             normal=-self.normal, relative=-self.relative, slide=-self.slide, gained=-self.gained, given=-self.given,
-            arms=self.arms[::-1], centres=self.centres[::-1],
+            arms=self.arms[::-1], segments=self.segments[::-1],
         )  # fmt: skip
 
 
@@ -142,7 +141,7 @@ def meet(pair: Pair, first: Party, second: Party, dt: float, constants: Constant
     a, b = first.segment, second.segment
     (v1, w1), (dv1, dw1), (v2, w2), (dv2, dw2) = first.before, first.gained, second.before, second.gained
 
-    def closest_at(time: Array) -> tuple[Closest, Array, Array, Array, Array, tuple[Array, Array]]:
+    def closest_at(time: Array) -> tuple[Closest, Array, Array, Array, Array, tuple[Segment, Segment]]:
         share = (time / dt)[..., None]
         half = 0.5 * share
         one = contact.moved(a, v1 + half * dv1, w1 + half * dw1, time)
@@ -152,7 +151,7 @@ def meet(pair: Pair, first: Party, second: Party, dt: float, constants: Constant
         relative = v1 + share * dv1 + jnp.cross(w1 + share * dw1, arm1)
         relative -= v2 + share * dv2 + jnp.cross(w2 + share * dw2, arm2)
         approach = jnp.sum(relative * found.normal, axis=-1)
-        return found, arm1, arm2, relative, approach, (one.centre, two.centre)
+        return found, arm1, arm2, relative, approach, (one, two)
 
     def advance(time: Array, nothing: None) -> tuple[Array, Array]:
         found, _, _, _, approach, _ = closest_at(time)
@@ -163,11 +162,8 @@ def meet(pair: Pair, first: Party, second: Party, dt: float, constants: Constant
 
     # A scan, because an unrolled loop would be compiled as many times over.
     time, gaps = jax.lax.scan(advance, jnp.zeros(a.radius.shape, v1.dtype), length=constants.advances)
-    found, arm1, arm2, relative, approach, centres = closest_at(time)
+    found, arm1, arm2, relative, approach, segments = closest_at(time)
     gained = dv1 + jnp.cross(dw1, arm1) - dv2 - jnp.cross(dw2, arm2)
-    acceleration = jnp.sum(gained * found.normal, axis=-1) / dt
-    depth = jnp.maximum(-found.distance, 0.0)
-    impact = contact.impact(depth, approach, acceleration, pair.surface, dt - time, constants.impedance)
     lowest = jnp.minimum(gaps[0], found.distance)
     given = sum(
         compliance(each.body, each.rows, each.seen.matrices, arm, each.seen.morphology, constants.held, each.chosen)
@@ -180,13 +176,13 @@ def meet(pair: Pair, first: Party, second: Party, dt: float, constants: Constant
         near=contact.smooth_gate(lowest, constants.margin),
         remaining=dt - time,
         normal=found.normal,
+        depth=jnp.maximum(-found.distance, 0.0),
         relative=relative,
         approach=approach,
         slide=relative - approach[..., None] * found.normal,
-        impact=impact,
         gained=gained,
         arms=(arm1, arm2),
-        centres=centres,
+        segments=segments,
         given=along_normal,
         mass=1.0 / jnp.sum(along_normal * found.normal, axis=-1),
     )

@@ -23,6 +23,7 @@ from larp_model.networks import Size, Statistics, Weights
 from larp_model.parts.articulated import Articulated, Response
 from larp_model.parts.bases import FromNothing, OverMechanics
 from larp_model.parts.contact import Contact
+from larp_model.parts.impacts import FreeImpact, SoftContacts
 from larp_model.parts.paper import PaperBody, PaperContact
 from larp_model.parts.part import (
     BodyPart,
@@ -37,14 +38,16 @@ from larp_model.parts.part import (
 )
 from larp_model.parts.sphere import Sphere
 from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface
+from larp_model.soft_contact import Rule
 
-VERSION = 2
+VERSION = 3
 SHIPPED = Path(__file__).parent / "weights"
 # What a manifest may speak of, by the name that it gives it.
 KINDS: dict[str, Any] = {
     "articulated": Articulated,
     "body": Body,
     "contact": Contact,
+    "free impact": FreeImpact,
     "from nothing": FromNothing,
     "joint": Joint,
     "link": Link,
@@ -56,6 +59,8 @@ KINDS: dict[str, Any] = {
     "paper's body": PaperBody,
     "paper's contact": PaperContact,
     "response": Response,
+    "rule": Rule,
+    "soft contacts": SoftContacts,
     "size": Size,
     "sphere": Sphere,
     "surface": Surface,

@@ -35,7 +35,7 @@ from mpc import CEM
 from tasks.data import contact_episodes, random_task
 from tasks.kick import WEIGHTS, Kick, Models, learned_models, planners_of, prepare, remember_compilations, run
 from tasks.presets import Preset
-from tasks.scenarios import ANY_HUMAN, Scenario, scenario, trained_at
+from tasks.scenarios import Scenario, scenario, trained_at
 
 EVALUATION_SEED = 1
 # Short episodes of impacts for each long one.
@@ -166,7 +166,7 @@ def main(
     Args:
         scene: what is simulated; human_ball is the kick's.
         design: which parts it is made of; compact for the kick and hybrid for all else by default.
-        size: of the hybrid's networks; base for any_human and small for all else by default.
+        size: of the hybrid's networks; small by default.
         folder: where the run keeps its stages and checkpoints; runs/train/SCENE by default, SCENE_DESIGN_SIZE where
             they are given.
         out: where the weights and their manifest go; a folder of the run's by default.
@@ -182,7 +182,7 @@ def main(
     kick = prepare() if (chosen.name, design) == (WEIGHTS, "compact") else None
     stages = PAPER if design == "paper" else KICK if kick else stages_of(chosen)
     if design == "hybrid":
-        model = designs.hybrid(chosen.scene, designs.SIZES[size or ("base" if chosen.name == ANY_HUMAN else "small")])
+        model = designs.hybrid(chosen.scene, designs.SIZES[size or "small"])
     elif size:
         raise ValueError(f"size is {size!r}, but only the hybrid design comes in sizes, not {design!r}")
     else:

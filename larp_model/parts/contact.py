@@ -1,9 +1,9 @@
-"""Contact of two bodies: the free impact of their links, which a network scales, turns and delays."""
+"""Contact of two bodies: what is known of the impulse between their links, and a network that corrects it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -21,19 +21,46 @@ from larp_model.scene import Body, Pair
 UP = np.array([0.0, 0.0, 1.0], np.float32)
 
 
+class Known(NamedTuple):
+    """What is known of P pairs of links that meet; vectors (B, P, 3) in the world frame.
+
+    change: (B, P) of the speed at which they part [m/s]. lag: (B, P) [s] for which the impulses act on positions.
+    impulses: on both links, the ground's answer included [N s]; moments: of these about the links' centres [N m s];
+    travel: see `Hits`. speeds [m/s] and scalars (B, P): what the network sees of all that.
+    """
+
+    change: Array
+    lag: Array
+    impulses: tuple[Array, Array]
+    moments: tuple[Array, Array]
+    travel: tuple[Array, Array]
+    speeds: tuple[Array, ...]
+    scalars: tuple[Array, ...]
+
+
+class Base(Protocol):
+    """What is known of a contact before anything learned is asked."""
+
+    def known(self, first: Party, second: Party, met: Meeting, part: Contact) -> Known:
+        """What the links of two bodies do to each other."""
+
+    def flipped(self, known: Known) -> Known:
+        """The same from the other's side."""
+
+
 class Push(NamedTuple):
-    """Between two links: impulse (B, P, 3) [N s] on the other and its lag (B, P, 1) [s].
+    """What a network adds: impulse (B, P, 3) [N s] on the other, and by how much (B, P, 1) [s] all of it acts longer.
 
     lifts: impulses (B, P, 3) [N s] with which the ground holds both.
     """
 
     impulse: Array
-    lag: Array
+    late: Array
     lifts: tuple[Array, Array]
 
     def flipped(self) -> Push:
         """The same from the other's side."""
-        return Push(-self.impulse, self.lag, self.lifts[::-1])
+        return Push(-self.impulse, self.late, self.lifts[::-1])
 
     def mean(self, other: Push) -> Push:
         """Half of both."""
@@ -44,18 +71,20 @@ class Push(NamedTuple):
 class Contact:
     """An impulse between two links, and how the ground holds against it; none where they are apart.
 
-    It is made of the contact's own vectors, and what the network sees of them are their products: turned or mirrored,
-    everything is as before. The same from either side: bodies are in the order of their kinds, and where they are of
-    one kind both views are taken, and their mean.
+    What the network adds to what its base knows is made of the contact's own vectors, and what it sees of them are
+    their products: turned or mirrored, everything is as before. The same from either side: bodies are in the order of
+    their kinds, and where they are of one kind both views are taken, and their mean.
 
-    bounds: what the network may add, so that no state, however odd, is thrown out of the world: share of the free
-    impact, normal speed [m/s], shares along the slide and along the four vectors of `view`, speeds up from the ground
+    bounds: what the network may add, so that no state, however odd, is thrown out of the world: share of the known
+    change, normal speed [m/s], shares along the slide and along the four vectors of `view`, speeds up from the ground
     [m/s], lag [ms]. grounded: height of a link above the ground at which it is not felt [m]. arm: unit of arms [m].
     """
 
     bodies: tuple[Body, Body]
     pair: Pair
     dt: float
+    gravity: float
+    base: Base
     size: Size
     bounds: tuple[float, ...] = (1.0, 3.0, 1.0, 1.0, 1.0, 1.0, 1.0, 3.0, 3.0, 5.0)
     grounded: float = 0.03
@@ -105,19 +134,24 @@ class Contact:
     def touch(self, weights: Weights, first: Party, second: Party) -> tuple[Hits, Hits]:
         """What links that meet do to each other's bodies."""
         met = meeting.meet(self.pair, first, second, self.dt, self.constants)
-        push = self.view(weights, first, second, met)
+        known = self.base.known(first, second, met, self)
+        push = self.view(weights, first, second, met, known)
         if self.symmetric:
-            push = push.mean(self.view(weights, second, first, met.flipped()).flipped())
-        one = _onto(first, -push.impulse, push.lag, met.arms[0], push.lifts[0])
-        return one, _onto(second, push.impulse, push.lag, met.arms[1], push.lifts[1])
+            push = push.mean(self.view(weights, second, first, met.flipped(), self.base.flipped(known)).flipped())
+        one, two = (
+            _onto(party, met, known, push, number, sign)
+            for number, (party, sign) in enumerate(((first, -1.0), (second, 1.0)))
+        )
+        return one, two
 
     def measure(self, seen: tuple[Kinematics, Kinematics], free: tuple[Velocities, Velocities]) -> Measured:
         """See `PairPart`."""
         first, second = meeting.parties(self.pair, self.bodies, seen, free)
         met = meeting.meet(self.pair, first, second, self.dt, self.constants)
-        views = [self.inputs(first, second, met)]
+        known = self.base.known(first, second, met, self)
+        views = [self.inputs(first, second, met, known)]
         if self.symmetric:
-            views.append(self.inputs(second, first, met.flipped()))
+            views.append(self.inputs(second, first, met.flipped(), self.base.flipped(known)))
         inputs, near = jnp.concatenate(views), jnp.concatenate([met.near] * len(views))
         return {self.name: (Statistics.of(inputs.reshape(-1, inputs.shape[-1]), near.reshape(-1) + RARELY), None)}
 
@@ -126,12 +160,13 @@ class Contact:
         """Whether both bodies are of one kind."""
         return self.bodies[0].kind == self.bodies[1].kind
 
-    def inputs(self, me: Party, other: Party, met: Meeting) -> Array:
+    def inputs(self, me: Party, other: Party, met: Meeting, known: Known) -> Array:
         """What the network sees (B, P, F): products of the contact's vectors, scalars, and which links meet."""
         swings = (jnp.cross(party.before.spin, arm) for party, arm in zip((me, other), met.arms, strict=True))
         up = jnp.broadcast_to(jnp.asarray(UP, met.normal.dtype), met.normal.shape)
         vectors = jnp.stack(
-            [met.normal, met.slide, up, met.mass[..., None] * met.given, met.gained, *met.arms, *swings], axis=-2
+            [met.normal, met.slide, up, met.mass[..., None] * met.given, met.gained, *known.speeds, *met.arms, *swings],
+            axis=-2,
         )
         products = jnp.sum(vectors[..., :, None, :] * vectors[..., None, :, :], axis=-1)
         each = [products[..., row, row:] for row in range(vectors.shape[-2])]
@@ -140,13 +175,13 @@ class Contact:
             jnp.clip(met.lowest, -0.05, 0.05),
             met.remaining,
             met.approach,
-            *met.impact,
+            *known.scalars,
             met.mass,
         ]
-        for party, centre in zip((me, other), met.centres, strict=True):
+        for party, segment in zip((me, other), met.segments, strict=True):
             sizes = jnp.broadcast_to(party.of(party.seen.morphology), (*met.gap.shape, 3))
             scalars += [
-                jnp.minimum(_clearance(party, centre), 0.3),
+                jnp.minimum(_clearance(party, segment.centre), 0.3),
                 party.before.velocity[..., 2],
                 *jnp.moveaxis(sizes, -1, 0),
             ]
@@ -157,28 +192,28 @@ class Contact:
             which.append(jnp.broadcast_to(named, (*met.gap.shape, len(links))))
         return jnp.concatenate([*each, jnp.stack(scalars, axis=-1), *which], axis=-1)
 
-    def view(self, weights: Weights, me: Party, other: Party, met: Meeting) -> Push:
-        """What one body does to the other, by its own lights.
+    def view(self, weights: Weights, me: Party, other: Party, met: Meeting, known: Known) -> Push:
+        """What one body does to the other, by its own lights, beyond what is known.
 
-        Along the normal: the free impact's, which the network scales and adds to. Across it: along the slide, and, in
-        shares of the free impact, along the directions in which the links give way, of up, and of both arms.
+        Along the normal: a share of the known change, and a speed. Across it: along the slide, and, in shares of that
+        change, along the directions in which the links give way, of up, and of both arms.
         """
-        outputs = evaluate(self.networks()[self.name], weights, self.name, self.inputs(me, other, met))
+        outputs = evaluate(self.networks()[self.name], weights, self.name, self.inputs(me, other, met, known))
         outputs = bounded(outputs, self.bounds) * met.near[..., None]
         scale, add, along, *shares, lift, other_lift, late = jnp.split(outputs, len(self.bounds), axis=-1)
-        change, mass = met.impact.change[..., None], met.mass[..., None]
+        change, mass = known.change[..., None], met.mass[..., None]
         up = jnp.asarray(UP, change.dtype)
-        velocity = (change * (1.0 + scale) + add) * met.normal + along * met.slide
+        velocity = (change * scale + add) * met.normal + along * met.slide
         directions = (mass * met.given, up, met.arms[0] / self.arm, met.arms[1] / self.arm)
         for share, direction in zip(shares, directions, strict=True):
             across = direction - jnp.sum(direction * met.normal, axis=-1, keepdims=True) * met.normal
             velocity += share * change * across
         lifts = (
-            mass * speed * contact.smooth_gate(_clearance(party, centre), self.grounded)[..., None] * up
-            for speed, party, centre in zip((lift, other_lift), (me, other), met.centres, strict=True)
+            mass * speed * contact.smooth_gate(_clearance(party, segment.centre), self.grounded)[..., None] * up
+            for speed, party, segment in zip((lift, other_lift), (me, other), met.segments, strict=True)
         )
         one, two = lifts
-        return Push(mass * velocity, met.impact.lag[..., None] + 0.001 * late, (one, two))
+        return Push(mass * velocity, 0.001 * late, (one, two))
 
 
 def _clearance(party: Party, centre: Array) -> Array:
@@ -187,11 +222,14 @@ def _clearance(party: Party, centre: Array) -> Array:
     return centre[..., 2] - jnp.abs(segment.half[..., 2]) - segment.radius
 
 
-def _onto(party: Party, impulse: Array, lag: Array, arm: Array, lift: Array) -> Hits:
-    """What an impulse (B, P, 3) [N s] at an arm and a lift from the ground do to the links of a body."""
-    own = picked(jnp.eye(len(party.body.links), dtype=impulse.dtype)[None, party.rows], party.chosen)
-    segment = party.segment
-    # The ground holds against the lower end.
-    foot = -jnp.sign(segment.half[..., 2:]) * segment.half
-    push = jnp.concatenate([impulse + lift, jnp.cross(arm, impulse) + jnp.cross(foot, lift)], axis=-1)
-    return Hits(*(jnp.sum(own[..., None] * each[:, :, None], axis=1) for each in (push, (impulse + lift) * lag)))
+def _onto(party: Party, met: Meeting, known: Known, push: Push, number: int, sign: float) -> Hits:
+    """What is known and what is learned do to one of the bodies: its number, and the sign of impulses on it."""
+    own = picked(jnp.eye(len(party.body.links), dtype=push.late.dtype)[None, party.rows], party.chosen)
+    impulse, lift = sign * push.impulse, push.lifts[number]
+    half = party.segment.half
+    foot = -jnp.sign(half[..., 2:]) * half  # the ground holds against the lower end
+    all_of_it = known.impulses[number] + impulse + lift
+    moment = known.moments[number] + jnp.cross(met.arms[number], impulse) + jnp.cross(foot, lift)
+    travel = known.travel[number] + (impulse + lift) * known.lag[..., None] + all_of_it * push.late
+    hits = jnp.concatenate([all_of_it, moment], axis=-1), travel
+    return Hits(*(jnp.sum(own[..., None] * each[:, :, None], axis=1) for each in hits))
