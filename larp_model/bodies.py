@@ -1,50 +1,17 @@
-"""Parametric builders: a ball, a capsule, a chain of capsules, a human; and the scenes they are used in.
-
-Segment masses of the human are the male means of P. de Leva, "Adjustments to Zatsiorsky-Seluyanov's segment inertia
-parameters", J. Biomechanics 29 (1996), table 4; segment lengths as fractions of height follow R. Drillis and
-R. Contini, "Body segment parameters" (1966), as in D. Winter, "Biomechanics and motor control of human movement".
-"""
+"""Parametric builders: a ball, a capsule, a chain of capsules, a human; and the scenes they are used in."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
-from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface, Vector
+from larp_model.anatomy import ANATOMIES, KINDS, Detail, Segment
+from larp_model.scene import Body, Joint, Link, Pair, Scene, Surface, Vector
 
 # A kicked football stays on the foot for about 10 ms and rebounds to 1.35-1.55 m when dropped from 2 m.
 BALL_SURFACE = Surface.bouncing(contact_time=0.010, restitution=0.86, friction=0.6)
-
-# Fractions of body mass (de Leva 1996, males). The pelvis is the lower trunk, the torso the middle and upper trunk;
-# the hand rides on the lower arm.
-_MASS = {
-    "pelvis": 0.1117,
-    "torso": 0.3229,
-    "head": 0.0694,
-    "upper_arm": 0.0271,
-    "lower_arm": 0.0162 + 0.0061,
-    "thigh": 0.1416,
-    "shin": 0.0433,
-    "foot": 0.0137,
-}
-
-# Motors: stiffness [N m/rad], damping [N m s/rad], torque limit [N m], bounds of the target (x roll, y pitch, z yaw)
-# [rad], given for the left side and mirrored for the right.
-_MOTOR = {
-    "torso": (900.0, 60.0, 400.0, (-0.5, -0.6, -0.7), (0.5, 0.9, 0.7)),
-    "head": (60.0, 4.0, 40.0, (-0.5, -0.6, -0.8), (0.5, 0.6, 0.8)),
-    "upper_arm": (120.0, 6.0, 100.0, (-0.5, -2.5, -1.0), (1.8, 1.2, 1.0)),
-    "lower_arm": (60.0, 3.0, 60.0, (-0.3, -2.4, -0.5), (0.3, 0.1, 0.5)),
-    "thigh": (900.0, 25.0, 400.0, (-0.5, -2.0, -0.8), (0.9, 0.9, 0.8)),
-    "shin": (600.0, 12.0, 300.0, (-0.1, -0.1, -0.2), (0.1, 2.4, 0.2)),
-    "foot": (400.0, 8.0, 200.0, (-0.5, -0.6, -0.5), (0.5, 1.0, 0.5)),
-}
-
-# Inertia of the motors [kg m^2]: light feet on stiff servos would ask for three times as many engine steps.
-ARMATURE = 0.01
-
-KICKING_LINKS = ("left_thigh", "left_shin", "left_foot", "right_thigh", "right_shin", "right_foot")
 
 
 def _positive(**values: float) -> None:
@@ -85,28 +52,28 @@ def human(
     mass: float = 70.0,
     lengths: dict[str, float] | None = None,
     radii: dict[str, float] | None = None,
+    detail: Detail = "lean",
 ) -> Body:
-    """A human of 13 links, standing upright in its rest pose, facing x, left towards y.
+    """A human, standing upright in its rest pose, arms hanging, facing x, left towards y.
 
     height [m] and mass [kg] scale every segment. `lengths` and `radii` multiply single segments, by segment name
-    without its side ("thigh", "foot", ...). Motors are in proportion: see `Body.sized`.
+    without its side ("thigh", "foot", ...). detail: 13 links, or the full 26; see `anatomy`. Motors are in proportion:
+    see `Body.sized`.
     """
     _positive(height=height, mass=mass)
+    if detail not in ANATOMIES:
+        raise ValueError(f"detail is {detail!r}, but must be one of {', '.join(ANATOMIES)}")
+    usual, size = _usual_human(name, detail), height / 1.75
+    segments = [segment_of(link.name) for link in usual.links]
     lengths, radii = dict(lengths or {}), dict(radii or {})
     for argument, factors in (("lengths", lengths), ("radii", radii)):
         for segment, factor in factors.items():
-            if segment not in _MASS:
-                raise ValueError(f"{argument} names {segment!r}, but the segments are {sorted(_MASS)}")
+            if segment not in segments:
+                raise ValueError(f"{argument} names {segment!r}, but the segments are {sorted(set(segments))}")
             _positive(**{f"{argument}[{segment!r}]": factor})
-    usual, size = _usual_human(name), height / 1.75
     sizes = [
-        (
-            size * lengths.get(segment, 1.0) * link.length,
-            size * radii.get(segment, 1.0) * link.radius,
-            mass * _MASS[segment],
-        )
-        for link in usual.links
-        for segment in [segment_of(link.name)]
+        (size * lengths.get(segment, 1.0) * link.length, size * radii.get(segment, 1.0) * link.radius, share)
+        for segment, link, share in zip(segments, usual.links, mass / 70.0 * usual.sizes[:, 2], strict=True)
     ]
     return usual.sized(np.array(sizes))
 
@@ -116,49 +83,43 @@ def segment_of(link: str) -> str:
     return link.removeprefix("left_").removeprefix("right_")
 
 
-def _usual_human(name: str) -> Body:
-    """A human of 1.75 m and 70 kg; its joints are at the heights that Winter gives, to 1 cm."""
+def detail_of(body: Body) -> Detail:
+    """In which detail a human is modelled; refuses other bodies."""
+    for detail, kind in KINDS.items():
+        if body.kind == kind:
+            return detail
+    raise ValueError(f"body {body.name!r} is a {body.kind}, but must be one of {', '.join(KINDS.values())}")
 
-    def link(name: str, length: float, radius: float, axis: Vector = (0.0, 0.0, 1.0)) -> Link:
-        return Link(name, length, radius, 70.0 * _MASS[segment_of(name)], axis)
 
-    def joint(child: str, parent: int, parent_anchor: Vector, child_anchor: Vector) -> Joint:
-        stiffness, damping, limit, lower, upper = _MOTOR[segment_of(child)]
-        if child.startswith("right_"):  # mirroring y turns roll and yaw round
-            lower, upper = (-upper[0], lower[1], -upper[2]), (-lower[0], upper[1], -lower[2])
-        return Joint(parent, parent_anchor, child_anchor, Motor(stiffness, damping, limit, lower, upper, ARMATURE))
-
-    links = [
-        link("pelvis", 0.14, 0.10, (0.0, 1.0, 0.0)),
-        link("torso", 0.315, 0.12),
-        link("head", 0.08, 0.095),
+def _usual_human(name: str, detail: Detail) -> Body:
+    """A human of 1.75 m and 70 kg."""
+    anatomy = ANATOMIES[detail]
+    rows = [
+        *((segment, "") for segment in anatomy.middle),
+        *((segment, side) for side in ("left_", "right_") for segment in anatomy.left),
     ]
-    joints = [
-        joint("torso", 0, (0.0, 0.0, 0.9), (0.0, 0.0, -1.15)),
-        joint("head", 1, (0.0, 0.0, 1.85), (0.0, 0.0, -2.5)),
-    ]
-    for side, y in (("left", 1.0), ("right", -1.0)):
-        arm, leg = len(links), len(links) + 2
-        links += [
-            link(f"{side}_upper_arm", 0.295, 0.045),
-            link(f"{side}_lower_arm", 0.30, 0.038),
-            link(f"{side}_thigh", 0.306, 0.075),
-            link(f"{side}_shin", 0.325, 0.050),
-            link(f"{side}_foot", 0.18, 0.042, (1.0, 0.0, 0.0)),
-        ]
-        joints += [
-            joint(f"{side}_upper_arm", 1, (0.0, 1.6 * y, 1.3), (0.0, 0.0, 1.1)),
-            joint(f"{side}_lower_arm", arm, (0.0, 0.0, -1.1), (0.0, 0.0, 1.0)),
-            joint(f"{side}_thigh", 0, (0.0, 1.25 * y, -0.3), (0.0, 0.0, 1.35)),
-            joint(f"{side}_shin", leg, (0.0, 0.0, -1.45), (0.0, 0.0, 1.35)),
-            joint(f"{side}_foot", leg + 1, (0.0, 0.0, -1.3), (-0.7, 0.0, 0.6)),
-        ]
-    return Body(name, "human", tuple(links), tuple(joints))
+    names = [side + segment.name for segment, side in rows]
+
+    def joint(segment: Segment, side: str) -> Joint:
+        parent = names.index(segment.above if segment.above in names else side + segment.above)
+        motor, (sign, at, own) = segment.motor, (1.0, segment.parent_anchor, segment.child_anchor)
+        if side == "right_":  # mirroring y turns roll and yaw round
+            sign = -1.0
+            if motor is not None:
+                (x, y, z), (roll, pitch, yaw) = motor.lower, motor.upper
+                motor = replace(motor, lower=(-roll, y, -yaw), upper=(-x, pitch, -z))
+        return Joint(parent, (at[0], sign * at[1], at[2]), (own[0], sign * own[1], own[2]), motor)
+
+    links = (
+        Link(each, part.length, part.radius, 70.0 * part.share, part.axis)
+        for each, (part, _) in zip(names, rows, strict=True)
+    )
+    return Body(name, KINDS[detail], tuple(links), tuple(joint(*row) for row in rows[1:]))
 
 
-def human_and_ball(height: float = 1.75, mass: float = 70.0, dt: float = 0.01) -> Scene:
+def human_and_ball(height: float = 1.75, mass: float = 70.0, dt: float = 0.01, detail: Detail = "lean") -> Scene:
     """The kick's scene: a human and a football; thighs, shins and feet can touch the ball."""
-    return _kicking(human(height=height, mass=mass), ball(), dt)
+    return _kicking(human(height=height, mass=mass, detail=detail), ball(), dt)
 
 
 def human_and_capsule(height: float = 1.75, mass: float = 70.0, dt: float = 0.01) -> Scene:
@@ -166,9 +127,16 @@ def human_and_capsule(height: float = 1.75, mass: float = 70.0, dt: float = 0.01
     return _kicking(human(height=height, mass=mass), capsule(), dt)
 
 
+def kicking_links(person: Body) -> tuple[str, ...]:
+    """Names of a human's links that can touch what it kicks: thighs, shins, feet, and toes if it has them."""
+    return tuple(link.name for link in person.links if segment_of(link.name) in ("thigh", "shin", "foot", "toes"))
+
+
 def _kicking(person: Body, struck: Body, dt: float) -> Scene:
-    pair = Pair(person.name, struck.name, KICKING_LINKS, tuple(link.name for link in struck.links), struck.surface)
-    return Scene((person, struck), (pair,), dt)
+    touching = tuple(link.name for link in struck.links)
+    return Scene(
+        (person, struck), (Pair(person.name, struck.name, kicking_links(person), touching, struck.surface),), dt
+    )
 
 
 def two_chains(links: int = 2, dt: float = 0.01) -> Scene:

@@ -21,14 +21,24 @@ from tasks.motions.references import Reference, clearance, resting
 STEPS, CONTACT_STEPS = 70, 10
 # How far random joint targets stray from the reference, standard deviation by segment [rad]; the planner's too.
 STRAY = {
+    "abdomen": 0.08,
     "torso": 0.15,
+    "chest": 0.08,
+    "neck": 0.03,
     "head": 0.05,
+    "collar": 0.05,
     "upper_arm": 0.15,
     "lower_arm": 0.10,
+    "hand": 0.10,
+    "fingers": 0.15,
+    "thumb": 0.10,
     "thigh": 0.25,
     "shin": 0.25,
     "foot": 0.20,
+    "toes": 0.10,
 }
+# A link that weighs less [kg] is pushed less, in proportion: a thumb would spin like a top.
+LIGHT = 0.5
 
 # Kicks that the benchmark asks for: bearing [degrees], distance [m], height [m] of the target; shift of the ball [m].
 BEARING, DISTANCE, HEIGHT, SHIFT = 25.0, (2.0, 5.0), (0.11, 1.0), 0.03
@@ -190,7 +200,8 @@ def pushes(random: np.random.Generator, scene: Scene, count: int, steps: int) ->
     torques = np.zeros((count, steps, len(scene.links), 3))
     pushed = np.flatnonzero(random.random(count) < 0.1)
     human = scene.rows("human")
-    torques[pushed, :10, human] = 4.0 * random.standard_normal((len(pushed), 1, human.stop - human.start, 3))
+    drawn = random.standard_normal((len(pushed), 1, human.stop - human.start, 3))
+    torques[pushed, :10, human] = 4.0 * np.minimum(scene.morphology[human, 2:] / LIGHT, 1.0) * drawn
     return torques
 
 

@@ -32,7 +32,8 @@ from rich.table import Table
 
 from larp_model import state as packed
 from larp_model import weights as stored
-from larp_model.bodies import human_and_ball, standing_height
+from larp_model.anatomy import Detail
+from larp_model.bodies import detail_of, human_and_ball, standing_height
 from larp_model.files import require_writable, write_whole
 from larp_model.networks import Weights
 from larp_model.parts.part import Model
@@ -59,7 +60,7 @@ from tasks.motions import references
 from tasks.motions.bvh import names_in
 from tasks.motions.references import Reference
 from tasks.presets import Preset, preset_of, usable
-from tasks.scenarios import ANY_HUMAN
+from tasks.scenarios import ANY_HUMAN, FULL_HUMAN
 from tasks.standing import Standing
 from viewer import LivePage, Recording, kick_picture, nearest_approach, write_html
 
@@ -298,6 +299,8 @@ def miss(path: np.ndarray, target: np.ndarray) -> float:
 
 def shipped(scene: Scene, reference: Path | None) -> Path:
     """The manifest of the shipped weights for a kick: of the embedded one, or of any human in any motion."""
+    if detail_of(scene.bodies[0]) == "full":
+        return stored.SHIPPED / f"{FULL_HUMAN}.json"
     embedded = reference is None and scene == human_and_ball()
     return stored.SHIPPED / f"{WEIGHTS if embedded else ANY_HUMAN}.json"
 
@@ -432,13 +435,16 @@ def prepare(
     substeps: int = FINE_SUBSTEPS,
     mass: float | None = None,
     names: Path | None = None,
+    detail: Detail = "lean",
 ) -> Kick:
     """The kick's scene with its reference: the embedded one, or a captured one from a BVH or an npz file.
 
     height: of the human [m]. substeps: engine steps of the truth in a step. mass: of the human [kg]; as heavy as its
-    height squared by default. names: JSON file of what a BVH file calls our joints; see `bvh.load`.
+    height squared by default. names: JSON file of what a BVH file calls our joints; see `bvh.load`. detail: of the
+    human; see `bodies.human`.
     """
-    scene = human_and_ball(height=height, mass=MASS * (height / HEIGHT) ** 2 if mass is None else mass)
+    heavy = MASS * (height / HEIGHT) ** 2 if mass is None else mass
+    scene = human_and_ball(height=height, mass=heavy, detail=detail)
     return kick_of(scene, body_reference, substeps, names)
 
 
@@ -463,6 +469,7 @@ def main(
     weights: Path | None = None,
     height: float = HEIGHT,
     mass: float | None = None,
+    body: Detail = "lean",
     seed: int = 0,
     out: Path = Path("runs/kick"),
     view: bool = False,
@@ -479,6 +486,7 @@ def main(
         weights: manifest of the weights of the learned model; those shipped for the kick by default.
         height: of the human [m].
         mass: of the human [kg]; as heavy as its height squared by default.
+        body: lean: 13 links; full: 26, with a spine, hands and toes.
         seed: of the planner's random numbers.
         out: folder for summary.json, kick.npz, kick.png and kick.html.
         view: show the kick live in the browser, on 127.0.0.1.
@@ -490,7 +498,7 @@ def main(
     chosen = preset_of(preset)
     require_writable(out, "out")
     remember_compilations()
-    kick = prepare(reference, height, mass=mass, names=names)
+    kick = prepare(reference, height, mass=mass, names=names, detail=body)
     models = models_of(kick.scene, dynamics, weights or shipped(kick.scene, reference))  # type: ignore[arg-type]
     planners = planners_of(kick, chosen, models)
     page = LivePage(port=port) if view else None

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from larp_model.bodies import chain, human_and_ball, human_and_capsule, two_balls, two_chains
+from larp_model.anatomy import KINDS
+from larp_model.bodies import chain, detail_of, human_and_ball, human_and_capsule, two_balls, two_chains
 from larp_model.designs import DesignName, SizeName
 from larp_model.scene import Scene
 from larp_model.truth.episodes import Episodes
@@ -19,6 +20,8 @@ from tasks.thrown import thrown_episodes
 CHAIN_WINDOWS = (10, 40, 80, 190)
 # The scenario, and the weights, of humans of every size in any motion.
 ANY_HUMAN = "any_human"
+# The same of the human in full detail.
+FULL_HUMAN = "full_human"
 
 
 @dataclass(frozen=True)
@@ -38,16 +41,29 @@ class Scenario:
     paper: tuple[tuple[str, tuple[float, ...]], ...] = ()
 
 
+def _kicking(scene: Scene) -> Scene:
+    """The scene of the human with a ball."""
+    return human_and_ball(detail=detail_of(scene.body("human")))
+
+
+def _embedded(scene: Scene) -> references.Reference:
+    return references.embedded(_kicking(scene))
+
+
 def _around_the_kick(scene: Scene, count: int, seed: int, varied: bool = False) -> tuple[Episodes, int]:
-    return random_episodes(scene, references.embedded(human_and_ball()), count, seed, varied=varied)
+    return random_episodes(scene, _embedded(scene), count, seed, varied=varied)
 
 
 def _any_human(scene: Scene, count: int, seed: int) -> tuple[Episodes, int]:
-    return any_episodes(scene, references.embedded(human_and_ball()), count, seed)
+    return any_episodes(scene, _embedded(scene), count, seed)
 
 
 def _human(name: str, scene: Scene, *paper: tuple[str, tuple[float, ...]]) -> Scenario:
     return Scenario(name, scene, partial(_around_the_kick, scene), WINDOWS, bool(scene.pairs), paper)
+
+
+def _any(name: str, scene: Scene) -> Scenario:
+    return Scenario(name, scene, partial(_any_human, scene), WINDOWS, strikes=True)
 
 
 def _thrown(name: str, scene: Scene, *paper: float, varied: bool = True) -> Scenario:
@@ -64,7 +80,8 @@ SCENARIOS = {
             "human_capsule", human_and_capsule(), ("human", (0.010, 0.031, 0.050)), ("capsule", (0.010, 0.042, 0.069))
         ),
         _human("human", human_and_ball().only("human")),
-        Scenario(ANY_HUMAN, human_and_ball(), partial(_any_human, human_and_ball()), WINDOWS, strikes=True),
+        _any(ANY_HUMAN, human_and_ball()),
+        _any(FULL_HUMAN, human_and_ball(detail="full")),
         _thrown("chain4", Scene((chain(links=4),))),
         _thrown("chains1", two_chains(1), 0.008, 0.021, 0.048, 0.173),
         _thrown("chains2", two_chains(2), 0.007, 0.023, 0.047, 0.137),
@@ -77,12 +94,12 @@ def around(chosen: Scenario, reference: Path | None, varied: bool) -> Scenario:
     """The scenario around another kick, a captured one (see `references.captured`), or with other bodies, or both."""
     if reference is None and not varied:
         return chosen
-    if not any(body.kind == "human" for body in chosen.scene.bodies):
+    if not any(body.kind in KINDS.values() for body in chosen.scene.bodies):
         asked = "reference" if reference else "bodies varied"
         raise ValueError(f"{asked} is asked for, but the scene {chosen.name} has no human")
     if reference is None:
         return replace(chosen, draw=partial(_around_the_kick, chosen.scene, varied=True), paper=())
-    kick = references.captured(reference, human_and_ball())
+    kick = references.captured(reference, _kicking(chosen.scene))
     return replace(chosen, draw=partial(random_episodes, chosen.scene, kick, varied=varied), paper=())
 
 

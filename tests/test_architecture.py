@@ -13,6 +13,7 @@ ROOT = Path(__file__).parents[1]
 ORDER = [
     "larp_model.files",
     "larp_model.scene",
+    "larp_model.anatomy",
     "larp_model.bodies",
     "larp_model.state",
     "larp_model.rotation",
@@ -64,6 +65,7 @@ ORDER = [
     "viewer.replay",
     "viewer.picture",
     "viewer",
+    "tasks.motions.details",
     "tasks.motions.key_poses",
     "tasks.motions.skeleton",
     "tasks.motions.rest_pose",

@@ -76,6 +76,13 @@ def test_the_weights_of_the_embedded_kick_are_used_for_it_alone() -> None:
         stored.load(kick.shipped(scene, reference), scene)
 
 
+def test_the_full_human_has_weights_of_its_own_and_may_touch_the_ball_with_its_toes() -> None:
+    scene = human_and_ball(detail="full")
+    assert kick.shipped(scene, None) == kick.shipped(scene, Path("clip.bvh")) == stored.SHIPPED / "full_human.json"
+    (pair,) = scene.pairs
+    assert {"left_toes", "right_toes"} < set(pair.first_links)
+
+
 def test_the_ball_distance_counts_the_way_between_steps() -> None:
     path = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
     assert kick.miss(path, np.array([1.0, 0.3, 0.0])) == pytest.approx(0.3, abs=1e-6)

@@ -25,6 +25,7 @@ from tasks.motions.references import standing_on_ground
 from tasks.thrown import thrown_episodes, thrown_starts
 
 BODIES = (capsule(), chain(links=2), chain(links=4), human())
+FULL = human(detail="full")
 COUNT, HIGH = 16, 10.0
 
 
@@ -140,7 +141,7 @@ def test_halving_the_step_leaves_less_than_a_third_of_the_error() -> None:
     assert error(2) < error(1) / 3 and error(4) < error(2) / 3
 
 
-@pytest.mark.parametrize(("body", "share"), [(BODIES[0], 0.05), (BODIES[2], 0.05), (BODIES[3], 0.2)])
+@pytest.mark.parametrize(("body", "share"), [(BODIES[0], 0.05), (BODIES[2], 0.05), (BODIES[3], 0.2), (FULL, 0.2)])
 def test_a_step_is_the_engines_but_for_a_share_of_its_change(body: Body, share: float) -> None:
     states, controls, torques = starts(body)
     truth = Truth(Scene((body,)), COUNT, 80)

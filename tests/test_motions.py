@@ -3,18 +3,25 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
 
 from larp_model import kinematics
 from larp_model import state as packed
 from larp_model.bodies import human, human_and_ball
+from larp_model.scene import Body
 from larp_model.training import first_contacts
 from larp_model.truth.mujoco import Truth
 from tasks.motions import references, styles
+from tasks.motions.details import in_detail
 from tasks.motions.generator import any_episodes, in_motion, planted
 from tasks.motions.people import BUILD, HEIGHT, MASS, VARIED, random_people
 from tasks.motions.references import clearance
 
 SCENE = human_and_ball()
+FULL = human_and_ball(detail="full")
 ROWS = SCENE.rows("human")
 HUMAN = SCENE.body("human")
 COUNT, STEPS = 60, 30
@@ -28,6 +35,11 @@ def reference() -> references.Reference:
 @pytest.fixture(scope="module")
 def people() -> np.ndarray:
     return random_people(np.random.default_rng(1), SCENE, 500)
+
+
+@pytest.fixture(scope="module")
+def full_reference() -> references.Reference:
+    return references.embedded(FULL)
 
 
 def test_people_are_as_tall_and_as_heavy_as_is_said(people: np.ndarray) -> None:
@@ -46,6 +58,57 @@ def test_people_are_alike_on_both_sides_and_leave_the_ball_as_it_is(people: np.n
         left, right = (people[:, SCENE.index("human", f"{side}_{name}")] for side in ("left", "right"))
         np.testing.assert_array_equal(left, right)
     assert (people[:, -1] == SCENE.morphology[-1]).all()
+
+
+@given(arrays(float, (12, 3), elements=st.floats(-1.5, 1.5)))
+def test_in_detail_a_body_turns_its_head_and_limbs_as_the_lean_one_does(targets: np.ndarray) -> None:
+    full = human(detail="full")
+    lean_turns, full_turns = (world_turns(body, in_detail(body, targets)) for body in (human(), full))
+    for name in ("pelvis", "head", "left_lower_arm", "right_upper_arm", "left_shin", "right_foot"):
+        assert (lean_turns[name].inv() * full_turns[name]).magnitude() < 1e-6, name
+    chest, torso = full_turns["chest"], lean_turns["torso"]
+    assert (torso.inv() * chest).magnitude() < 1e-6
+    np.testing.assert_array_equal(in_detail(human(), targets), targets)
+
+
+def world_turns(body: Body, targets: np.ndarray) -> dict[str, Rotation]:
+    """How the links of a body are turned whose joints are as targets (J, 3) [rad] want them."""
+    found = {body.links[0].name: Rotation.identity()}
+    for (child, joint, _), turn in zip(body.motors, targets, strict=True):
+        parent = body.links[joint.parent].name
+        found[body.links[child].name] = found[parent] * Rotation.from_rotvec(turn)
+    return found
+
+
+def test_in_detail_mirrored_targets_are_mirrored(reference: references.Reference) -> None:
+    full, targets = human(detail="full"), reference.controls[:40]
+    mirrored = styles.mirrored(full, in_detail(full, targets))
+    np.testing.assert_allclose(mirrored, in_detail(full, styles.mirrored(HUMAN, targets)), atol=1e-12)
+
+
+def test_the_full_human_performs_the_embedded_kick(
+    reference: references.Reference, full_reference: references.Reference
+) -> None:
+    strike = reference.strike
+    assert abs(full_reference.strike - strike) <= 2
+    for name in ("pelvis", "left_foot", "right_shin"):
+        lean, full = (
+            each.states[strike, scene.index("human", name), :3]
+            for each, scene in ((reference, SCENE), (full_reference, FULL))
+        )
+        assert np.linalg.norm(lean - full) < 0.15, name
+    ball = full_reference.states[full_reference.strike + 10, -1, packed.VELOCITY]
+    assert ball[0] > 8.0 and abs(ball[1]) < 0.2 * ball[0]
+
+
+def test_full_humans_come_in_any_size_and_motion(full_reference: references.Reference) -> None:
+    episodes, dropped = any_episodes(FULL, full_reference, 32, 7, 30)
+    apart = kinematics.displacement(FULL, jnp.asarray(episodes.states), jnp.asarray(episodes.morphology)[:, None])
+    assert len(episodes.states) + dropped == 32 and dropped <= 1
+    assert float(jnp.abs(apart).max()) < 1e-5
+    assert np.abs(episodes.states[..., packed.ANGULAR_VELOCITY]).max() < 120.0, "no thumb spins like a top"
+    masses = episodes.morphology[:, FULL.rows("human"), 2].sum(axis=1)
+    assert np.ptp(masses) > 20.0
 
 
 def test_mirroring_twice_changes_nothing_and_once_is_what_the_other_foot_does(reference: references.Reference) -> None:

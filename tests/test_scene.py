@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from larp_model import kinematics
-from larp_model.bodies import ball, capsule, chain, human, human_and_ball, standing_height
+from larp_model.anatomy import ANATOMIES, Detail
+from larp_model.bodies import ball, capsule, chain, detail_of, human, human_and_ball, standing_height
 from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface, anchor
 
 NAN, INFINITY = math.nan, math.inf
@@ -86,6 +87,9 @@ def test_a_description_refuses_nonsense_by_field(description: Link, field: str, 
         (lambda: human(mass=0.0), "mass is 0.0"),
         (lambda: human(lengths={"tail": 1.0}), "lengths names 'tail'"),
         (lambda: human(radii={"shin": 0.0}), "radii"),
+        (lambda: human(lengths={"toes": 1.0}), "lengths names 'toes'"),
+        (lambda: human(detail="fine"), "detail is 'fine', but must be one of lean, full"),  # type: ignore[arg-type]
+        (lambda: detail_of(ball()), "'ball' is a ball, but must be one of human, full_human"),
         (lambda: human_and_ball(dt=-0.01), "dt is -0.01"),
     ],
 )  # fmt: skip
@@ -122,6 +126,7 @@ def test_only_keeps_the_bodies_named_and_their_pairs() -> None:
     assert (alone.dt, alone.gravity) == (scene.dt, scene.gravity)
 
 
+IN_DETAIL = pytest.mark.parametrize("detail", ANATOMIES)
 FACTOR = st.floats(0.5, 2.0)
 
 
@@ -136,9 +141,10 @@ def test_anchors_scale_with_the_morphology(length: float, radius: float) -> None
         np.testing.assert_allclose(kinematics.anchors([point], [link.axis], shape)[0], scaled, atol=1e-6)
 
 
+@IN_DETAIL
 @given(st.floats(1.2, 2.2), st.floats(30.0, 150.0))
-def test_a_human_has_its_mass_and_stands_on_its_height(height: float, mass: float) -> None:
-    body = human(height=height, mass=mass)
+def test_a_human_has_its_mass_and_stands_on_its_height(detail: Detail, height: float, mass: float) -> None:
+    body = human(height=height, mass=mass, detail=detail)
     assert sum(link.mass for link in body.links) == pytest.approx(mass, rel=1e-3)
     assert standing_height(body) == pytest.approx(standing_height(human()) * height / 1.75)
     assert 0.5 * height < standing_height(body) < 0.6 * height
@@ -157,20 +163,42 @@ def joint_heights(body: Body) -> dict[str, float]:
     return heights | {"top": centres[body.link("head")] + 0.5 * head.length + head.radius}
 
 
-def test_a_human_is_as_tall_as_it_says() -> None:
-    assert joint_heights(human(height=1.9))["top"] == pytest.approx(1.9, rel=0.005)
+@IN_DETAIL
+def test_a_human_is_as_tall_as_it_says(detail: Detail) -> None:
+    assert joint_heights(human(height=1.9, detail=detail))["top"] == pytest.approx(1.9, rel=0.005)
 
 
-def test_joints_are_at_the_heights_of_drillis_and_contini() -> None:
-    heights = joint_heights(human(height=1.75))
+@IN_DETAIL
+def test_joints_are_at_the_heights_of_drillis_and_contini(detail: Detail) -> None:
+    heights = joint_heights(human(height=1.75, detail=detail))
     published = {"left_upper_arm": 0.818, "left_thigh": 0.530, "left_shin": 0.285, "left_foot": 0.039}
     published["left_lower_arm"] = 0.818 - 0.186
     for name, share in published.items():
         assert heights[name] == pytest.approx(share * 1.75, abs=0.01), name
 
 
-def test_the_right_side_mirrors_the_left() -> None:
-    body = human()
+def test_a_full_human_has_26_links_and_what_the_lean_one_has_at_the_same_places() -> None:
+    lean, full = human(), human(detail="full")
+    assert len(lean.links) == 13 and len(full.links) == 26
+    assert {link.name for link in lean.links} < {link.name for link in full.links}
+    heights, others = joint_heights(lean), joint_heights(full)
+    for name in ("left_upper_arm", "left_lower_arm", "left_thigh", "left_shin", "left_foot", "top"):
+        assert others[name] == pytest.approx(heights[name], abs=1e-3), name
+    for parts, whole in (
+        (("abdomen", "torso", "chest", "left_collar", "right_collar"), ("torso",)),
+        (("neck", "head"), ("head",)),
+        (("left_lower_arm", "left_hand", "left_fingers", "left_thumb"), ("left_lower_arm",)),
+        (("left_foot", "left_toes"), ("left_foot",)),
+    ):
+        weights = [
+            sum(body.links[body.link(name)].mass for name in names) for body, names in ((full, parts), (lean, whole))
+        ]
+        assert weights[0] == pytest.approx(weights[1], rel=1e-3)
+
+
+@IN_DETAIL
+def test_the_right_side_mirrors_the_left(detail: Detail) -> None:
+    body = human(detail=detail)
     for child, joint, motor in body.motors:
         name = body.links[child].name
         if not name.startswith("left_"):
@@ -183,9 +211,11 @@ def test_the_right_side_mirrors_the_left() -> None:
         np.testing.assert_allclose(twin.motor.lower, [-motor.upper[0], motor.lower[1], -motor.upper[2]])
 
 
+@IN_DETAIL
 @given(FACTOR)
-def test_segments_are_scaled_by_name(factor: float) -> None:
-    body, scaled = human(), human(lengths={"thigh": factor}, radii={"foot": factor})
+def test_segments_are_scaled_by_name(detail: Detail, factor: float) -> None:
+    body = human(detail=detail)
+    scaled = human(lengths={"thigh": factor}, radii={"foot": factor}, detail=detail)
     for before, after in zip(body.links, scaled.links, strict=True):
         assert after.length == pytest.approx(before.length * (factor if before.name.endswith("thigh") else 1.0))
         assert after.radius == pytest.approx(before.radius * (factor if before.name.endswith("foot") else 1.0))

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from larp_model import contact, kinematics
 from larp_model import state as packed
-from larp_model.bodies import KICKING_LINKS, ball, capsule, chain, human
+from larp_model.bodies import ball, capsule, chain, human, kicking_links
 from larp_model.designs import LEAST, compact
 from larp_model.parts.part import initial_weights, measure
 from larp_model.scene import Pair, Scene
@@ -529,7 +529,9 @@ def drawn(kind: str, random: np.random.Generator | None) -> Scene:
     if len(chosen) == 1:
         return Scene(chosen)
     first, second = chosen
-    one, two = (KICKING_LINKS if each.kind == "human" else tuple(link.name for link in each.links) for each in chosen)
+    one, two = (
+        kicking_links(each) if each.kind == "human" else tuple(link.name for link in each.links) for each in chosen
+    )
     return Scene(chosen, (Pair(first.name, second.name, one, two, ball().surface),))
 
 

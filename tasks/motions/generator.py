@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from larp_model import bodies
 from larp_model import state as packed
 from larp_model.scene import Body, Scene
 from larp_model.truth.episodes import Episodes, record
 from larp_model.truth.mujoco import Truth, closed
 from tasks.data import STEPS, out_of_legs, pushes, random_places, smooth_noise, stray, turned_about_z
 from tasks.motions import styles
+from tasks.motions.details import in_detail
 from tasks.motions.people import random_people
 from tasks.motions.references import Reference, clearance, standing_on_ground
 
@@ -56,13 +58,13 @@ def in_motion(
     human, rows, count = scene.body("human"), scene.rows("human"), len(sizes)
     kicking, walking = round(KICKS * count), round(GAITS * count)
     begin = np.where(random.random(kicking) < 0.4, 0, random.integers(0, BEGUN, kicking))
-    targets = np.concatenate(
-        [
-            styles.kicks(random, human, begin, steps, scene.dt),
-            styles.gaits(random, human, walking, steps, scene.dt),
-            styles.moves(random, human, count - kicking - walking, steps, scene.dt),
-        ]
+    lean = bodies.human()
+    performed = (
+        styles.kicks(random, lean, begin, steps, scene.dt),
+        styles.gaits(random, lean, walking, steps, scene.dt),
+        styles.moves(random, lean, count - kicking - walking, steps, scene.dt),
     )
+    targets = np.clip(in_detail(human, np.concatenate(performed)), *styles.limits(human))
     falling = np.where(random.random((count, 1)) < 0.15, 4.0, 1.0)
     lean = Rotation.from_rotvec(falling * random.standard_normal((count, 3)) * (0.12, 0.15, 0.0))
     states = standing_on_ground(scene, targets[:, 0], lean, sizes)

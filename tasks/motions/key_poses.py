@@ -13,7 +13,9 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from larp_model.bodies import human
 from larp_model.scene import Body
+from tasks.motions.details import in_detail
 
 FILE = Path(__file__).with_suffix(".json")
 
@@ -35,14 +37,14 @@ class KeyPoses:
 
     def controls(self, body: Body, steps: int, dt: float) -> np.ndarray:
         """Joint targets (steps, J, 3) [rad] of the body, monotone between key poses; the last pose is held."""
-        names = [body.links[child].name for child, _, _ in body.motors]
+        lean = human()
+        names = [lean.links[child].name for child, _, _ in lean.motors]
         times = np.minimum(np.arange(steps) * dt, self.times[-1])
         controls = np.zeros((steps, len(names), 3))
         for (joint, axis), angles in self.angles.items():
             controls[:, names.index(joint), axis] = PchipInterpolator(self.times, angles)(times)
-        lower = np.array([motor.lower for _, _, motor in body.motors])
-        upper = np.array([motor.upper for _, _, motor in body.motors])
-        return np.clip(controls, lower, upper)
+        lower, upper = (np.array([getattr(motor, end) for _, _, motor in body.motors]) for end in ("lower", "upper"))
+        return np.clip(in_detail(body, controls), lower, upper)
 
 
 def load(path: Path = FILE) -> KeyPoses:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from larp_model.bodies import human, segment_of
+from larp_model.bodies import detail_of, human, segment_of
 from larp_model.scene import Scene
 
 # Heights [m], masses [kg], and which masses go with a height: mass / height^2 [kg/m^2].
@@ -16,7 +16,7 @@ VARIED = 0.15
 def random_people(random: np.random.Generator, scene: Scene, count: int) -> np.ndarray:
     """Morphologies (count, L, 3) of the scene, its human another one in each; both sides of a human are alike."""
     sizes = np.broadcast_to(scene.morphology, (count, len(scene.links), 3)).astype(float)
-    usual = human()
+    usual = human(detail=detail_of(scene.body("human")))
     segments = [segment_of(link.name) for link in usual.links]
     names, places = np.unique(segments, return_inverse=True)
     height = random.uniform(*HEIGHT, (count, 1))

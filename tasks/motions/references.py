@@ -15,6 +15,7 @@ from larp_model.bodies import standing_height
 from larp_model.scene import Body, Link, Scene
 from larp_model.truth.mujoco import Truth, closed, finite
 from tasks.motions import angles, bvh, key_poses, skeleton
+from tasks.motions.details import in_detail
 from tasks.motions.key_poses import KeyPoses
 from tasks.motions.skeleton import Motion
 from tasks.motions.tracking import Tracker
@@ -92,7 +93,7 @@ def resting(link: Link, states: np.ndarray, sizes: np.ndarray | None = None) -> 
 def starts(scene: Scene, poses: Sequence[KeyPoses]) -> np.ndarray:
     """The states (N, L, 13) in which kicks of key poses begin; the ball is as far away as the human is tall."""
     human, ball = scene.bodies[0], scene.bodies[-1]
-    size = standing_height(human) / standing_height(bodies.human())
+    size = standing_height(human) / standing_height(bodies.human(detail=bodies.detail_of(human)))
     first = np.concatenate([each.controls(human, 1, scene.dt) for each in poses])
     states = standing_on_ground(scene, first, Rotation.from_euler("xy", [each.lean for each in poses]))
     states[:, : len(human.links), packed.VELOCITY] = np.array([each.velocity for each in poses])[:, None]
@@ -186,7 +187,8 @@ def _wanted(scene: Scene, clip: Motion) -> tuple[np.ndarray, np.ndarray]:
     The targets are ahead of the joint angles by what the servos lag behind: damping / stiffness.
     """
     human, ball = scene.bodies[0], scene.bodies[-1]
-    orientations, poses = skeleton.retarget(clip, human, scene.dt)
+    orientations, lean = skeleton.retarget(clip, bodies.human(), scene.dt)
+    poses = in_detail(human, lean)
     root = Rotation.from_quat(orientations, scalar_first=True)
     states = standing_on_ground(scene, poses, root)
     rows = scene.rows(human.name)

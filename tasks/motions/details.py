@@ -1,0 +1,26 @@
+"""Motions are said in joints of the lean human; a more detailed one performs them with all that it has."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from larp_model.anatomy import CHAINS
+from larp_model.bodies import detail_of, human
+from larp_model.scene import Body
+
+
+def in_detail(body: Body, targets: np.ndarray) -> np.ndarray:
+    """Joint targets (*, J, 3) [rad] of a human for those of the lean one (*, 12, 3).
+
+    Joints in a row share a turn; what the lean human has not stays at rest.
+    """
+    if detail_of(body) == "lean":
+        return targets
+    lean, found = human(), np.zeros((*targets.shape[:-2], len(body.motors), 3))
+    rows = {body.links[child].name: row for row, (child, _, _) in enumerate(body.motors)}
+    for row, (child, _, _) in enumerate(lean.motors):
+        name = lean.links[child].name
+        chain = CHAINS.get(name, (name,))
+        for each in chain:
+            found[..., rows[each], :] = targets[..., row, :] / len(chain)
+    return found
