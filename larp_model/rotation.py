@@ -1,19 +1,42 @@
-"""Rotations of packed arrays: brax.math over leading dimensions, and what it lacks.
+"""Rotations of packed arrays.
 
 Quaternions are (*, 4), w first. Everything here has finite gradients at zero angle.
 """
 
 from __future__ import annotations
 
-import brax.math
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from larp_model import state as packed
 
-multiply = jnp.vectorize(brax.math.quat_mul, signature="(4),(4)->(4)")
-matrix = jnp.vectorize(brax.math.quat_to_3x3, signature="(4)->(3,3)")
+
+def multiply(first: Array, second: Array) -> Array:
+    """Products (*, 4) of quaternions: of rotations, the second and then the first."""
+    a, b, c, d = (first[..., k] for k in range(4))
+    w, x, y, z = (second[..., k] for k in range(4))
+    return jnp.stack(
+        [
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        ],
+        axis=-1,
+    )
+
+
+def matrix(quaternion: Array) -> Array:
+    """Rotation matrices (*, 3, 3) of quaternions (*, 4) of any length but zero."""
+    w, x, y, z = (quaternion[..., k] for k in range(4))
+    double = 2.0 / (w * w + x * x + y * y + z * z)
+    rows = (
+        (1.0 - double * (y * y + z * z), double * (x * y - w * z), double * (x * z + w * y)),
+        (double * (x * y + w * z), 1.0 - double * (x * x + z * z), double * (y * z - w * x)),
+        (double * (x * z - w * y), double * (y * z + w * x), 1.0 - double * (x * x + y * y)),
+    )
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def conjugate(quaternion: Array) -> Array:

@@ -18,6 +18,7 @@ from rich.console import Console
 
 from larp_model import evaluation, training
 from larp_model import weights as stored
+from larp_model.anatomy import Detail
 from larp_model.bodies import human_and_ball
 from larp_model.files import require_writable
 from larp_model.networks import Weights
@@ -28,8 +29,8 @@ from larp_model.truth.episodes import Episodes
 from larp_model.weights import Trained
 from tasks.data import WINDOWS, random_episodes
 from tasks.kick import HEIGHT, learned_models, prepare, remember_compilations, run
-from tasks.scenarios import ANY_HUMAN
-from tasks.train import HUMAN, IMPACTS, OVER_MECHANICS, on_policy_contacts, planned_episodes
+from tasks.scenarios import ANY_HUMAN, FULL_HUMAN
+from tasks.train import IMPACTS, OVER_MECHANICS, on_policy_contacts, planned_episodes
 
 # Episodes that weights are checked on, those drawn at a time, and shares of the time: random truth, and what the
 # planner tries; of what is then left, the swing before the impact.
@@ -75,7 +76,8 @@ def trained_on(
     seed: int,
 ) -> Weights:
     """Weights trained on for so many seconds: the human's swing on long episodes, then impacts on short too."""
-    swing = replace(OVER_MECHANICS, learning_rate=RATE, updates=MOST, seed=seed, only=HUMAN)
+    human = (f"dynamics/{model.scene.bodies[0].kind}",)
+    swing = replace(OVER_MECHANICS, learning_rate=RATE, updates=MOST, seed=seed, only=human)
     impact = replace(IMPACTS, learning_rate=RATE, updates=MOST, seed=seed + 1)
     for name, recipe, sources, limit in (
         ("swing", swing, long, seconds[0]),
@@ -92,8 +94,9 @@ def main(
     names: Path | None = None,
     height: float = HEIGHT,
     mass: float | None = None,
+    body: Detail = "lean",
     minutes: float = 10.0,
-    weights: Path = stored.SHIPPED / f"{ANY_HUMAN}.json",
+    weights: Path | None = None,
     out: Path = Path("runs/adapt"),
     seed: int = 0,
 ) -> None:
@@ -104,8 +107,9 @@ def main(
         names: JSON object of what the BVH file calls our joints: {"Hips": "pelvis", ...}; known skeletons need none.
         height: of the human [m].
         mass: of the human [kg]; as heavy as its height squared by default.
+        body: lean: 13 links; full: 26, with a spine, hands and toes.
         minutes: that it may take.
-        weights: manifest of the weights to go on from.
+        weights: manifest of the weights to go on from; those shipped for any human by default.
         out: folder for the new weights and their manifest.
         seed: of the truth and the training.
     """
@@ -122,8 +126,9 @@ def main(
         left = max(0.0, whole - (time.perf_counter() - begin)) / 60.0
         console.print(f"{what}; {left:.1f} min left")
 
-    model, start, content = stored.load(weights, human_and_ball())
-    kick = prepare(reference, height, mass=mass, names=names)
+    known_by = weights or stored.SHIPPED / f"{ANY_HUMAN if body == 'lean' else FULL_HUMAN}.json"
+    model, start, content = stored.load(known_by, human_and_ball(detail=body))
+    kick = prepare(reference, height, mass=mass, names=names, detail=body)
     scene, known = kick.scene, stored.trained_sizes(content)
     model = model.on(scene)
     for difference in (each for body in scene.bodies for each in stored.beyond(body, known[body.kind])):

@@ -214,7 +214,8 @@ def contact_episodes(
     """
     random = np.random.default_rng(seed)
     contacts = first_contacts(scene, source)
-    rows = random.choice(np.flatnonzero((contacts >= 0) & (contacts + steps <= source.steps)), count)
+    # In order, so that a body is built once for all its episodes.
+    rows = np.sort(random.choice(np.flatnonzero((contacts >= 0) & (contacts + steps <= source.steps)), count))
     begin = np.maximum(contacts[rows] - random.integers(0, 4, count), 0)
     states, sizes = source.states[rows, begin].astype(float), source.morphology[rows]
     columns = begin[:, None] + np.arange(steps)

@@ -1,6 +1,8 @@
 """The layout of the project: imports point one way, importing does nothing, and data is never executed."""
 
 import ast
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -192,6 +194,14 @@ def test_imports_point_upwards(path: Path) -> None:
 def test_importing_does_nothing(path: Path) -> None:
     found = [f"line {statement.lineno}: {ast.unparse(statement)}" for statement in effects(parse(path).body)]
     assert not found, f"{module_name(path)} acts when imported:\n" + "\n".join(found)
+
+
+def test_importing_everything_prints_nothing() -> None:
+    said = subprocess.run(
+        [sys.executable, "-c", "; ".join(f"import {name}" for name in ORDER)],
+        cwd=ROOT, check=True, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )  # fmt: skip
+    assert said.stdout == ""
 
 
 @pytest.mark.parametrize("path", FILES + TESTS, ids=module_name)

@@ -33,24 +33,26 @@ def quaternions(seed: int, count: int = 200) -> np.ndarray:
 
 
 def test_identity_and_inverse() -> None:
-    q = quaternions(0)
-    np.testing.assert_allclose(rotation.multiply(q, IDENTITY), q, atol=1e-15)
-    np.testing.assert_allclose(rotation.multiply(IDENTITY, q), q, atol=1e-15)
-    one = np.broadcast_to(IDENTITY, q.shape)
-    np.testing.assert_allclose(rotation.multiply(q, rotation.conjugate(jnp.asarray(q))), one, atol=1e-14)
+    q, one = jnp.asarray(quaternions(0)), jnp.asarray(IDENTITY)
+    np.testing.assert_allclose(rotation.multiply(q, one), q, atol=1e-15)
+    np.testing.assert_allclose(rotation.multiply(one, q), q, atol=1e-15)
+    undone = rotation.multiply(q, rotation.conjugate(q))
+    np.testing.assert_allclose(undone, np.broadcast_to(IDENTITY, q.shape), atol=1e-14)
 
 
 def test_multiplication_is_associative() -> None:
-    a, b, c = quaternions(1), quaternions(2)[::-1], np.roll(quaternions(3), 70, axis=0)
+    a, b, c = map(jnp.asarray, (quaternions(1), quaternions(2)[::-1], np.roll(quaternions(3), 70, axis=0)))
     left = rotation.multiply(rotation.multiply(a, b), c)
     np.testing.assert_allclose(left, rotation.multiply(a, rotation.multiply(b, c)), atol=1e-14)
 
 
 def test_matrices_multiply_as_quaternions_do() -> None:
-    a, b = quaternions(1), quaternions(2)[::-1]
+    a, b = jnp.asarray(quaternions(1)), jnp.asarray(quaternions(2)[::-1])
     product = rotation.matrix(rotation.multiply(a, b))
     np.testing.assert_allclose(product, rotation.matrix(a) @ rotation.matrix(b), atol=1e-14)
-    np.testing.assert_allclose(rotation.matrix(a), Rotation.from_quat(a, scalar_first=True).as_matrix(), atol=1e-14)
+    np.testing.assert_allclose(
+        rotation.matrix(a), Rotation.from_quat(np.asarray(a), scalar_first=True).as_matrix(), atol=1e-14
+    )
 
 
 @given(st.floats(0.0, np.pi - 1e-6), st.integers(0, 2**16))
