@@ -9,6 +9,7 @@ from mpc.mppi import MPPI
 from mpc.planner import Plan, PlanInfo, Planner
 from mpc.search import Optimizer
 from mpc.spline import interpolate, shift
+from mpc.unless import Unless
 from mpc.verified import Verified
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "Plan",
     "PlanInfo",
     "Planner",
+    "Unless",
     "Verified",
     "absolute",
     "evaluate",

@@ -29,6 +29,10 @@ Residuals = dict[str, np.ndarray]
 """By term, (N, R) or (N, T, R), of N candidates."""
 
 
+Enough = tuple[tuple[str, float], ...]
+"""Residuals by name, and the length that each of them may have where a candidate is good enough."""
+
+
 class Tried(NamedTuple):
     """What N candidates came to."""
 
@@ -86,6 +90,22 @@ class Optimizer(Protocol):
 
     def improve(self, search: Search, random: np.random.Generator, problem: Problem) -> Search:
         """The search after all rounds, with as many elites as before, ranked by what they cost."""
+
+
+def require_enough(enough: Enough) -> None:
+    """Refuses lengths that are none."""
+    for name, length in enough:
+        if not 0.0 <= length < np.inf:
+            raise ValueError(f"enough: got {length} for {name!r}, needs a finite number >= 0")
+
+
+def suffices(enough: Enough, cost: float, residuals: Residuals) -> bool:
+    """Whether one candidate, of this cost and residuals (1, ...), is good enough."""
+    for name, _ in enough:
+        if name not in residuals:
+            raise ValueError(f"enough: got {name!r}, needs names of cost terms: {', '.join(residuals)}")
+    short = [np.linalg.norm(residuals[name]) <= length for name, length in enough]
+    return bool(short) and bool(np.isfinite(cost)) and all(short)
 
 
 def best_first(knots: np.ndarray, costs: np.ndarray, count: int | None) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from mpc.dynamics import Dynamics
-from mpc.search import Optimizer, Problem, Residuals, Search, distinct, merged
+from mpc.search import Enough, Optimizer, Problem, Residuals, Search, distinct, merged, require_enough, suffices
 
 
 class Trial(NamedTuple):
@@ -43,16 +43,14 @@ class Verified:
     """Trials of candidates, at most; one only ranks what was found."""
     candidates: int = 8
     """Tried in each round, none twice; in the first the plan carried on too, so that none replaces a better one."""
-    enough: tuple[tuple[str, float], ...] = ()
-    """Residuals by name whose length, in truth, ends the trials once it is no more than this."""
+    enough: Enough = ()
+    """What ends the trials, in truth."""
 
     def __post_init__(self) -> None:
         for name, least in {"rounds": 1, "candidates": 1}.items():
             if getattr(self, name) < least:
                 raise ValueError(f"{name}: got {getattr(self, name)}, needs at least {least}")
-        for name, length in self.enough:
-            if not 0.0 <= length < np.inf:
-                raise ValueError(f"enough: got {length} for {name!r}, needs a finite number >= 0")
+        require_enough(self.enough)
 
     @property
     def differentiates(self) -> bool:
@@ -76,7 +74,7 @@ class Verified:
             for row, each in enumerate(knots):
                 tried.append(Trial(each, float(found.costs[row]), found.row(row).residuals))
             best = min(tried, key=lambda trial: trial.cost)
-            if index == self.rounds - 1 or self.suffices(best):
+            if index == self.rounds - 1 or suffices(self.enough, best.cost, best.residuals):
                 break
             if index and not any(best is trial for trial in tried[-len(knots) :]) and np.isfinite(best.cost):
                 proposed = 0.5 * (best.knots + knots)
@@ -92,11 +90,6 @@ class Verified:
         return merged(
             search, np.stack([each.knots for each in tried]), np.array([each.cost for each in tried], np.float32)
         )
-
-    def suffices(self, trial: Trial) -> bool:
-        """Whether no further trial is needed."""
-        lengths = [np.linalg.norm(trial.residuals[name]) <= most for name, most in self.enough]
-        return bool(lengths) and np.isfinite(trial.cost) and all(lengths)
 
     @staticmethod
     def corrected(best: Trial, problem: Problem) -> Problem:

@@ -55,6 +55,7 @@ ORDER = [
     "mpc.gradient",
     "mpc.gauss_newton",
     "mpc.verified",
+    "mpc.unless",
     "mpc.problem",
     "mpc.planner",
     "mpc.loop",

@@ -20,6 +20,7 @@ from mpc import (
     Gradient,
     MujocoDynamics,
     Planner,
+    Unless,
     absolute,
     evaluate,
     interpolate,
@@ -124,6 +125,7 @@ OPTIMIZERS: dict[str, Any] = {
     "mppi": MPPI(samples=32, rounds=4, elites=4),
     "gauss_newton": GaussNewton(rounds=3, directions=6, jacobian="forward"),
     "differences": GaussNewton(rounds=3, directions=6, elites=2),
+    "unless": (GaussNewton(rounds=1, directions=3), Unless((("miss", 1e-3),), (CEM(24, 2, 5), GaussNewton(rounds=1)))),
     "small_rounds": (Gradient(steps=2, elites=9), CEM(samples=8, rounds=6, elites=4), GaussNewton(directions=3)),
 }
 

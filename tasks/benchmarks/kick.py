@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
+from larp_model.anatomy import Detail
 from larp_model.truth.mujoco import FINE_SUBSTEPS
 from tasks.benchmarks import report
 from tasks.data import random_roll, random_task
@@ -114,6 +115,7 @@ def main(
     reference: Path | None = None,
     height: float = HEIGHT,
     bodies: Literal["usual", "varied"] = "usual",
+    body: Detail = "lean",
     rolling: float = 0.0,
     noise: bool = False,
     budget: float | None = None,
@@ -132,6 +134,7 @@ def main(
         reference: a captured kick (BVH) instead of the embedded one.
         height: of the human [m].
         bodies: varied: every kick is another human's, of any size.
+        body: lean: 13 links; full: 26, with a spine, hands and toes.
         rolling: greatest speed [m/s] of a ball that comes from ahead or from the kicking side; 0: it rests.
         noise: show the planner the state with sensing noise.
         budget: seconds for the first plan, and a fifth of them for each replan; the preset is scaled to fit.
@@ -149,6 +152,7 @@ def main(
         "reference": reference.stem if reference else "",
         "height": f"{height:g}" if height != HEIGHT else "",
         "bodies": bodies if bodies != "usual" else "",
+        "body": body if body != "lean" else "",
         "rolling": f"{rolling:g}" if rolling else "",
         "noise": "on" if noise else "",
         "budget": f"{budget:g}" if budget is not None else "",
@@ -165,7 +169,7 @@ def main(
         fitting = chosen if budget is None else within(chosen, budget, partial(seconds_of, kick, models))
         return kick, models, planners_of(kick, fitting, models)
 
-    usual = prepare(reference, height, substeps)
+    usual = prepare(reference, height, substeps, detail=body)
     people = random_people(np.random.default_rng((seed, 1)), usual.scene, targets)
     always = planned(usual) if bodies == "usual" else None
     random = np.random.default_rng(seed)

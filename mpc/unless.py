@@ -1,0 +1,48 @@
+"""Optimisers that are called upon only where the plan is not good enough yet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mpc.search import Enough, Optimizer, Problem, Search, require_enough, suffices
+
+
+@dataclass(frozen=True)
+class Unless:
+    """Nothing, where the best candidate's residuals are short `enough`; else these optimisers, one after the other.
+
+    A way out of where descent got stuck, for the price of one candidate everywhere else.
+    """
+
+    enough: Enough
+    """Residuals by name, and the length that each may have."""
+    optimizers: tuple[Optimizer, ...]
+
+    def __post_init__(self) -> None:
+        require_enough(self.enough)
+        if not (self.enough and self.optimizers):
+            raise ValueError(f"enough, optimizers: got {self.enough}, {self.optimizers}, needs some of both")
+        for each in self.optimizers:
+            if getattr(each, "settles", False):
+                raise ValueError(f"optimizers: got {type(each).__name__}, which must come last of all")
+
+    @property
+    def differentiates(self) -> bool:
+        """As any of its optimisers does."""
+        return any(each.differentiates for each in self.optimizers)
+
+    @property
+    def elites(self) -> int:
+        """As many as any of its optimisers needs."""
+        return max(each.elites for each in self.optimizers)
+
+    def improve(self, search: Search, random: np.random.Generator, problem: Problem) -> Search:
+        """The search as it is, or after all rounds of all optimisers."""
+        best = problem.tries(search.elites[:1])
+        if suffices(self.enough, float(best.costs[0]), best.residuals):
+            return search
+        for each in self.optimizers:
+            search = each.improve(search, random, problem)
+        return search
