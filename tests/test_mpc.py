@@ -21,6 +21,7 @@ from mpc import (
     MujocoDynamics,
     Planner,
     Unless,
+    Verified,
     absolute,
     evaluate,
     interpolate,
@@ -189,6 +190,53 @@ def test_target_weights_and_time_compile_nothing_again() -> None:
     other, info = planner.step(plan, single, REFERENCE + 0.01, -TARGET, {"miss": 2.5}, now=1.02)
     assert info.compile_seconds == 0 and float(other.start) == pytest.approx(1.02)
     assert planner.step(other, STATE, REFERENCE, TARGET, now=7)[1].compile_seconds == 0
+
+
+class Hollows:
+    """A problem of one angle x: r = 0.5 + |x| up to x = 1, x - 2 beyond; at 0 no slope tells of the zero at 2."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def tries(self, knots: np.ndarray) -> Tried:
+        x = knots[:, :1, 0, 0]
+        self.asked += len(x)
+        residual = np.where(x < 1.0, 0.5 + np.abs(x), x - 2.0)
+        return Tried(np.sum(residual**2, axis=1), {"miss": residual}, {"miss": np.full_like(residual, 2.0)})
+
+
+def _at(x: float, elites: int) -> Search:
+    knots = np.zeros((elites, 2, 1, 3), np.float32)
+    knots[:, :, 0, 0] = x
+    spread = np.tile(2.0 * np.eye(1, 3, dtype=np.float32), (2, 1, 1))
+    return Search(knots[0], spread, knots, np.full(elites, np.inf, np.float32), spread[0])
+
+
+def test_unless_leaves_a_hollow_and_asks_for_one_candidate_where_nothing_is_amiss() -> None:
+    steps = GaussNewton(rounds=6, directions=4)
+    unless = Unless((("miss", 0.1),), (CEM(24, 6, 6, decay=1.0), steps))
+    stuck, problem = _at(0.0, unless.elites), Hollows()
+    alone = steps.improve(stuck, np.random.default_rng(0), problem)  # type: ignore[arg-type]
+    assert problem.tries(alone.elites[:1]).costs[0] > 0.24
+    freed = unless.improve(alone, np.random.default_rng(0), problem)  # type: ignore[arg-type]
+    assert problem.tries(freed.elites[:1]).costs[0] < 1e-4
+
+    problem = Hollows()
+    assert unless.improve(freed, np.random.default_rng(0), problem) is freed  # type: ignore[arg-type]
+    assert problem.asked == 1
+
+
+def test_unless_refuses_what_it_cannot_judge_by() -> None:
+    steps, problem = GaussNewton(), Hollows()
+    unless = Unless((("speed", 0.1),), (steps,))
+    with pytest.raises(ValueError, match="enough: got 'speed', needs names of cost terms: miss"):
+        unless.improve(_at(0.0, 1), np.random.default_rng(0), problem)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="enough: got nan for 'miss', needs a finite number >= 0"):
+        Unless((("miss", np.nan),), (steps,))
+    with pytest.raises(ValueError, match="needs some of both"):
+        Unless((), (steps,))
+    with pytest.raises(ValueError, match="optimizers: got Verified, which must come last of all"):
+        Unless((("miss", 0.1),), (Verified(PointMass(), steps),))
 
 
 def test_locked_axis_never_moves() -> None:
