@@ -82,10 +82,12 @@ class Seconds(NamedTuple):
 def within(preset: Preset, seconds: float, measure: Callable[[Preset], Seconds]) -> Preset:
     """The preset with as many candidates as its first plan can try in `seconds`, and each replan in a fifth of them.
 
-    The plans that keep the human up do not take longer than replans either. measure: what a preset's plans take.
+    The plans that keep the human up do not take longer than replans either, and what a plan would do only where it went
+    astray is left out. measure: what a preset's plans take.
     """
     if not (math.isfinite(seconds) and seconds > 0.0):
         raise ValueError(f"budget is {seconds}, but must be a finite number of seconds > 0")
+    preset = replace(preset, first=tuple(each for each in preset.first if not isinstance(each, Unless)))
     fitting, factors = preset, Seconds(1.0, 1.0, 1.0)
     least = scaled(preset, Seconds(0.0, 0.0, 0.0))
     for _ in range(3):
@@ -129,8 +131,6 @@ def fitted(optimizer: Optimizer, factor: float) -> Optimizer:
             rounds = max(1, round(factor * optimizer.rounds))
             share = min(1.0, factor * optimizer.rounds)
             return replace(optimizer, rounds=rounds, directions=max(LEAST, round(share * optimizer.directions)))
-        case Unless():
-            return replace(optimizer, optimizers=tuple(fitted(each, factor) for each in optimizer.optimizers))
         case Gradient():
             return replace(optimizer, steps=max(1, round(factor * optimizer.steps)))
     return optimizer

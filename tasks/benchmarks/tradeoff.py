@@ -15,7 +15,7 @@ from rich.table import Table
 
 from larp_model import weights as stored
 from larp_model.truth.mujoco import SUBSTEPS
-from mpc import CEM, MPPI, GaussNewton, Gradient, Optimizer
+from mpc import CEM, MPPI, GaussNewton, Gradient, Optimizer, Unless
 from tasks.benchmarks import report
 from tasks.data import random_task
 from tasks.kick import BEYOND, FLIGHT, WEIGHTS, Kick, models_of, planners_of, prepare, remember_compilations, run
@@ -76,6 +76,8 @@ def _told(stage: Sequence[Optimizer]) -> str:
             case GaussNewton():
                 slopes = "forward" if each.jacobian == "forward" else f"step {each.step:g}"
                 return f"GN {each.directions}x{each.rounds} {slopes}"
+            case Unless():
+                return f"if astray {_told(each.optimizers)}"
         raise ValueError(f"optimizer is {each}, but must be one that has a name here")
 
     return " + ".join(map(one, stage)) or "nothing"
