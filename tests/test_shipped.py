@@ -38,6 +38,7 @@ def test_the_shipped_chains_err_no_more_than_they_did(name: str, bars: tuple[flo
         ("human_ball", {"10": (0.006, 0.003), "38": (0.024, 0.04)}, (0.16, 5.0)),
         ("human_capsule", {"10": (0.004, 0.005), "38": (0.018, 0.04)}, (0.3, 12.0)),
         ("any_human", {"10": (0.004, 0.005), "38": (0.028, 0.07)}, (0.15, 6.0)),
+        ("full_human", {"10": (0.004, 0.006), "38": (0.028, 0.08)}, (0.2, 7.0)),
     ],
 )
 def test_the_shipped_human_and_what_it_strikes_err_no_more_than_they_did(
