@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -27,19 +28,24 @@ from larp_model.simulator import Simulator
 from larp_model.truth import episodes as truth_episodes
 from larp_model.truth.episodes import Episodes
 from larp_model.weights import Trained
-from tasks.data import WINDOWS, random_episodes
+from tasks.data import STEPS, WINDOWS, contact_episodes, random_episodes
 from tasks.kick import HEIGHT, learned_models, prepare, remember_compilations, run
 from tasks.scenarios import ANY_HUMAN, FULL_HUMAN
-from tasks.train import IMPACTS, OVER_MECHANICS, on_policy_contacts, planned_episodes
+from tasks.train import IMPACTS, OVER_MECHANICS, planned_episodes
 
-# Episodes that weights are checked on, those drawn at a time, and shares of the time: random truth, and what the
-# planner tries; of what is then left, the swing before the impact.
-HELD_OUT, DRAWN, TRUTH, PLANS, SWING = 64, 256, 0.15, 0.2, 0.55
+# Episodes that weights are checked on, and those drawn at a time.
+HELD_OUT, DRAWN = 64, 256
+# Shares of the time: random truth, random truth of the strike alone, and what the planner tries; of what is then left,
+# the swing before the impact.
+TRUTH, STRIKES, PLANS, SWING = 0.1, 0.15, 0.15, 0.4
+# Steps of episodes of the strike alone, and of those from just before a recorded contact. Different strikes are what
+# impacts are learned from: from a few thousand, each disturbed, weights learn those few.
+STRIKE, IMPACT = 14, 6
 # Of each plan so many candidates, and more kicks than are planned in any time.
 ELITES, KICKS = 8, 100
 # The check at the end [s], and the least that is worth beginning [min].
 CHECKING, LEAST = 20.0, 2.0
-# Learning rate of what has learned already, and more updates than fit into any time.
+# Learning rate of a swing that has been learned already, and more updates than fit into any time.
 RATE, MOST = 3e-4, 1_000_000
 
 
@@ -69,23 +75,22 @@ def check(model: Model, weights: Weights, episodes: Episodes) -> Checked:
 def trained_on(
     model: Model,
     learned: Weights,
-    long: list[Episodes],
-    short: Episodes,
+    swings: Sequence[Episodes],
+    impacts: Sequence[Episodes],
     folder: Path,
     seconds: tuple[float, float],
     seed: int,
 ) -> Weights:
-    """Weights trained on for so many seconds: the human's swing on long episodes, then impacts on short too."""
+    """Weights trained on for so many seconds: the human's swing, then impacts; every episode counts alike."""
     human = (f"dynamics/{model.scene.bodies[0].kind}",)
     swing = replace(OVER_MECHANICS, learning_rate=RATE, updates=MOST, seed=seed, only=human)
-    impact = replace(IMPACTS, learning_rate=RATE, updates=MOST, seed=seed + 1)
+    impact = replace(IMPACTS, updates=MOST, seed=seed + 1)
     for name, recipe, sources, limit in (
-        ("swing", swing, long, seconds[0]),
-        ("impact", impact, [*long, short], seconds[1]),
+        ("swing", swing, swings, seconds[0]),
+        ("impact", impact, impacts, seconds[1]),
     ):
-        learned, _ = training.train(
-            model, recipe, [(each, 1.0) for each in sources], folder / name, learned, seconds=limit
-        )
+        shares = [(each, float(len(each.states))) for each in sources]
+        learned, _ = training.train(model, recipe, shares, folder / name, learned, seconds=limit)
     return learned
 
 
@@ -137,18 +142,26 @@ def main(
     held_out, _ = random_episodes(scene, kick.reference, HELD_OUT, 1_000_000 + seed)
     before = check(model, start, held_out)
     tell(f"{HELD_OUT} episodes to check on; {described(before)}")
-    drawing = time.perf_counter()
-    parts: list[Episodes] = []
-    while not parts or (time.perf_counter() - drawing < TRUTH * whole and len(parts) * DRAWN < MOST):
-        parts.append(random_episodes(scene, kick.reference, DRAWN, seed + len(parts))[0])
-    long = truth_episodes.join(parts)
+
+    def drawn(steps: int, share: float, first: int) -> Episodes:
+        """Random truth of so many steps, for a share of the time."""
+        began, parts = time.perf_counter(), list[Episodes]()
+        while not parts or (time.perf_counter() - began < share * whole and len(parts) * DRAWN < MOST):
+            parts.append(random_episodes(scene, kick.reference, DRAWN, first + len(parts), steps)[0])
+        return truth_episodes.join(parts)
+
+    long, strikes = drawn(STEPS, TRUTH, seed), drawn(STRIKE, STRIKES, 2_000_000 + seed)
     tried, _ = planned_episodes(kick, learned_models(scene, model, start, "start"), KICKS, ELITES, seed, PLANS * whole)
-    short, _ = on_policy_contacts(scene, long, tried, len(long.states), seed)
-    tell(f"{len(long.states)} random episodes, {len(tried.states)} of plans, {len(short.states)} of impacts")
+    impacts = [
+        contact_episodes(scene, source, len(strikes.states) // share, seed + number, IMPACT)[0]
+        for number, (source, share) in enumerate(((strikes, 1), (long, 2), (tried, 4)))
+    ]
+    counts = [sum(len(each.states) for each in kind) for kind in ((long,), (tried,), (strikes, *impacts))]
+    tell("{} random episodes, {} of plans, {} of strikes".format(*counts))
     left = whole - (time.perf_counter() - begin) - CHECKING
     with tempfile.TemporaryDirectory() as folder:
         learned = trained_on(
-            model, start, [long, tried], short, Path(folder), (SWING * left, (1.0 - SWING) * left), seed
+            model, start, (long, tried), (strikes, *impacts), Path(folder), (SWING * left, (1.0 - SWING) * left), seed
         )
     after = check(model, learned, held_out)
     tell(f"trained; {described(after)}")
