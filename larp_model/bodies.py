@@ -118,7 +118,7 @@ def _usual_human(name: str, detail: Detail) -> Body:
 
 
 def human_and_ball(height: float = 1.75, mass: float = 70.0, dt: float = 0.01, detail: Detail = "lean") -> Scene:
-    """The kick's scene: a human and a football; thighs, shins and feet can touch the ball."""
+    """The kick's scene: a human and a football, which its `kicking_links` can touch; detail: see `human`."""
     return _kicking(human(height=height, mass=mass, detail=detail), ball(), dt)
 
 

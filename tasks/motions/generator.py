@@ -58,11 +58,11 @@ def in_motion(
     human, rows, count = scene.body("human"), scene.rows("human"), len(sizes)
     kicking, walking = round(KICKS * count), round(GAITS * count)
     begin = np.where(random.random(kicking) < 0.4, 0, random.integers(0, BEGUN, kicking))
-    lean = bodies.human()
+    usual = bodies.human()
     performed = (
-        styles.kicks(random, lean, begin, steps, scene.dt),
-        styles.gaits(random, lean, walking, steps, scene.dt),
-        styles.moves(random, lean, count - kicking - walking, steps, scene.dt),
+        styles.kicks(random, usual, begin, steps, scene.dt),
+        styles.gaits(random, usual, walking, steps, scene.dt),
+        styles.moves(random, usual, count - kicking - walking, steps, scene.dt),
     )
     targets = np.clip(in_detail(human, np.concatenate(performed)), *styles.limits(human))
     falling = np.where(random.random((count, 1)) < 0.15, 4.0, 1.0)
