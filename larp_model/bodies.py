@@ -12,6 +12,8 @@ from larp_model.scene import Body, Joint, Link, Pair, Scene, Surface, Vector
 
 # A kicked football stays on the foot for about 10 ms and rebounds to 1.35-1.55 m when dropped from 2 m.
 BALL_SURFACE = Surface.bouncing(contact_time=0.010, restitution=0.86, friction=0.6)
+# One leg on the other: flesh gives for longer than a ball, and gives little back. Chosen, not measured.
+LEG_SURFACE = Surface.bouncing(contact_time=0.020, restitution=0.4, friction=0.5)
 
 
 def _positive(**values: float) -> None:
@@ -53,20 +55,21 @@ def human(
     lengths: dict[str, float] | None = None,
     radii: dict[str, float] | None = None,
     detail: Detail = "lean",
+    motors: dict[str, float] | None = None,
 ) -> Body:
     """A human, standing upright in its rest pose, arms hanging, facing x, left towards y.
 
     height [m] and mass [kg] scale every segment. `lengths` and `radii` multiply single segments, by segment name
-    without its side ("thigh", "foot", ...). detail: 13 links, or the full 26; see `anatomy`. Motors are in proportion:
-    see `Body.sized`.
+    without its side ("thigh", "foot", ...). detail: 13 links, or the full 26; see `anatomy`. Motors are in proportion,
+    see `Body.sized`, and `motors` multiplies those of single segments' joints.
     """
     _positive(height=height, mass=mass)
     if detail not in ANATOMIES:
         raise ValueError(f"detail is {detail!r}, but must be one of {', '.join(ANATOMIES)}")
     usual, size = _usual_human(name, detail), height / 1.75
     segments = [segment_of(link.name) for link in usual.links]
-    lengths, radii = dict(lengths or {}), dict(radii or {})
-    for argument, factors in (("lengths", lengths), ("radii", radii)):
+    lengths, radii, motors = dict(lengths or {}), dict(radii or {}), dict(motors or {})
+    for argument, factors in (("lengths", lengths), ("radii", radii), ("motors", motors)):
         for segment, factor in factors.items():
             if segment not in segments:
                 raise ValueError(f"{argument} names {segment!r}, but the segments are {sorted(set(segments))}")
@@ -75,7 +78,12 @@ def human(
         (size * lengths.get(segment, 1.0) * link.length, size * radii.get(segment, 1.0) * link.radius, share)
         for segment, link, share in zip(segments, usual.links, mass / 70.0 * usual.sizes[:, 2], strict=True)
     ]
-    return usual.sized(np.array(sizes))
+    larger = usual.sized(np.array(sizes))
+    joints = (
+        joint if joint.motor is None else replace(joint, motor=joint.motor.times(motors.get(segment, 1.0)))
+        for joint, segment in zip(larger.joints, segments[1:], strict=True)
+    )
+    return replace(larger, joints=tuple(joints))
 
 
 def segment_of(link: str) -> str:
@@ -117,9 +125,15 @@ def _usual_human(name: str, detail: Detail) -> Body:
     return Body(name, KINDS[detail], tuple(links), tuple(joint(*row) for row in rows[1:]))
 
 
-def human_and_ball(height: float = 1.75, mass: float = 70.0, dt: float = 0.01, detail: Detail = "lean") -> Scene:
-    """The kick's scene: a human and a football, which its `kicking_links` can touch; detail: see `human`."""
-    return _kicking(human(height=height, mass=mass, detail=detail), ball(), dt)
+def human_and_ball(
+    height: float = 1.75, mass: float = 70.0, dt: float = 0.01, detail: Detail = "lean", self_contact: bool = False
+) -> Scene:
+    """The kick's scene: a human and a football, which its `kicking_links` can touch; detail: see `human`.
+
+    self_contact: whether one leg can touch the other, below the knee; else they pass through each other.
+    """
+    scene = _kicking(human(height=height, mass=mass, detail=detail), ball(), dt)
+    return replace(scene, pairs=(*scene.pairs, _legs(scene.bodies[0]))) if self_contact else scene
 
 
 def human_and_capsule(height: float = 1.75, mass: float = 70.0, dt: float = 0.01) -> Scene:
@@ -130,6 +144,13 @@ def human_and_capsule(height: float = 1.75, mass: float = 70.0, dt: float = 0.01
 def kicking_links(person: Body) -> tuple[str, ...]:
     """Names of a human's links that can touch what it kicks: thighs, shins, feet, and toes if it has them."""
     return tuple(link.name for link in person.links if segment_of(link.name) in ("thigh", "shin", "foot", "toes"))
+
+
+def _legs(person: Body) -> Pair:
+    """One leg against the other, below the knee: above it they touch whenever one stands, and flesh gives way."""
+    below = [name for name in kicking_links(person) if segment_of(name) != "thigh"]
+    left, right = (tuple(name for name in below if name.startswith(side)) for side in ("left_", "right_"))
+    return Pair(person.name, person.name, left, right, LEG_SURFACE)
 
 
 def _kicking(person: Body, struck: Body, dt: float) -> Scene:

@@ -95,8 +95,8 @@ def by_window(scene: Scene, distance: np.ndarray, windows: Sequence[int]) -> dic
 
 
 def struck(scene: Scene) -> int | None:
-    """The row of the link that others strike, if there is one: the second body of the first pair, if of one link."""
-    for pair in scene.pairs[:1]:
+    """The row of the link that others strike: the second body of the first pair of two, if of one link; or none."""
+    for pair in scene.between.pairs[:1]:
         if len(scene.body(pair.second).links) == 1:
             return scene.index(pair.second, pair.second_links[0])
     return None
@@ -111,7 +111,7 @@ def launch(simulator: Simulator, episodes: Trajectories, before: int) -> dict[st
     row = struck(scene)
     if row is None:
         raise ValueError("simulator.scene has no body of one link that another can strike")
-    contacts = first_contacts(scene, episodes)
+    contacts = first_contacts(scene.between, episodes)
     steps = before + LAUNCH_STEPS
     rows = np.flatnonzero((contacts >= before) & (contacts + LAUNCH_STEPS <= episodes.controls.shape[1]))
     rows = rows[speed(episodes.states[rows, contacts[rows] + LAUNCH_STEPS, row]) > LAUNCH_SPEED]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 
@@ -202,16 +203,29 @@ class Body:
                 return index
         raise ValueError(f"body {self.name!r} has no link {name!r}; it has {[link.name for link in self.links]}")
 
+    def tied(self, one: str, other: str) -> bool:
+        """Whether two links are the same, or one is the other's parent."""
+        near, far = sorted((self.link(one), self.link(other)))
+        return near == far or self.joints[far - 1].parent == near
+
 
 @dataclass(frozen=True)
 class Pair:
-    """Two bodies that can touch, with the links of each that can; what is not named is not simulated."""
+    """Two bodies that can touch, with the links of each that can; what is not named is not simulated.
+
+    Where both are one body, links of it can touch others of it.
+    """
 
     first: str
     second: str
     first_links: tuple[str, ...]
     second_links: tuple[str, ...]
     surface: Surface
+
+    @property
+    def of_itself(self) -> bool:
+        """Whether a body touches itself."""
+        return self.first == self.second
 
     def flipped(self) -> Pair:
         """The same pair, its bodies named the other way round."""
@@ -237,15 +251,17 @@ class Scene:
         if len(set(met)) != len(met):
             raise ValueError(f"scene.pairs are of {met}, but two bodies may be named together once")
         for pair in self.pairs:
-            if pair.first == pair.second:
-                raise ValueError(
-                    f"scene.pairs names {pair.first!r} twice: contact of a body with itself is not modelled"
-                )
             for name, links in ((pair.first, pair.first_links), (pair.second, pair.second_links)):
                 if not links or len(set(links)) != len(links):
                     raise ValueError(f"scene.pairs names the links {links} of {name!r}, but needs some, each once")
                 for link in links:
                     self.body(name).link(link)
+            for one, other in product(pair.first_links, pair.second_links):
+                if pair.of_itself and self.body(pair.first).tied(one, other):
+                    raise ValueError(
+                        f"scene.pairs lets {one!r} and {other!r} of {pair.first!r} touch, but they are one link, or "
+                        "tied by a joint"
+                    )
 
     def body(self, name: str) -> Body:
         """The body of that name."""
@@ -304,6 +320,16 @@ class Scene:
         if sizes.shape != (len(self.links), 3):
             raise ValueError(f"morphology has shape {sizes.shape}, but needs ({len(self.links)}, 3)")
         return replace(self, bodies=tuple(body.sized(sizes[self.rows(body.name)]) for body in self.bodies))
+
+    @property
+    def between(self) -> Scene:
+        """The scene with contacts of different bodies alone."""
+        return replace(self, pairs=tuple(pair for pair in self.pairs if not pair.of_itself))
+
+    @property
+    def within(self) -> Scene:
+        """The scene with contacts of bodies with themselves alone."""
+        return replace(self, pairs=tuple(pair for pair in self.pairs if pair.of_itself))
 
     def only(self, *names: str) -> Scene:
         """The scene with these bodies alone."""

@@ -49,7 +49,8 @@ class Recipe:
 
     curriculum: (unroll in steps, share of the updates) in order. learning_rate falls to `final` of itself by a cosine.
     clip: largest gradient norm. drop: norm beyond which a batch is dropped. contact_share: windows that start from
-    `before_contact` steps before to `after_contact` steps after the first contact. emphasis: weight of each body's
+    `before_contact` steps before to `after_contact` steps after the first contact, of two bodies or, where `within`, of
+    a body with itself. emphasis: weight of each body's
     links in the loss. only: beginnings of the names of the networks to train; the others stay as they are. None: all.
     """
 
@@ -63,6 +64,7 @@ class Recipe:
     contact_share: float = 0.7
     before_contact: int = 10
     after_contact: int = 0
+    within: bool = False
     emphasis: tuple[tuple[str, float], ...] = (("ball", 3.0), ("capsule", 3.0))
     loss: LossWeights = field(default_factory=LossWeights)
     stop_gradient: bool = True
@@ -110,7 +112,8 @@ class Windows:
         self.sources, self.recipe = [source for source, _ in sources], recipe
         share = np.array([share for _, share in sources], float)
         self.share = share / share.sum()
-        self.contacts = [first_contacts(scene, source) for source in self.sources]
+        touching = scene.within if recipe.within else scene.between
+        self.contacts = [first_contacts(touching, source) for source in self.sources]
 
     def draw(self, random: np.random.Generator, steps: int) -> Batch:
         """Windows of so many steps."""
@@ -160,6 +163,14 @@ def statistics_of(model: Model, windows: Windows, random: np.random.Generator, b
     return initial_weights(model, jax.random.key(int(random.integers(2**31))), found)
 
 
+def begun(model: Model, windows: Windows, random: np.random.Generator, start: Weights | None) -> Weights:
+    """The weights that training begins with: those of `start`, and fresh ones for what it lacks."""
+    if start is not None and set(start.networks) >= set(model.networks()):
+        return start
+    fresh = statistics_of(model, windows, random)
+    return fresh if start is None else Weights(*(new | old for new, old in zip(fresh, start, strict=True)))
+
+
 def emphasis(scene: Scene, recipe: Recipe) -> Array:
     """Weight (L,) of each link in the loss."""
     factors = dict(recipe.emphasis)
@@ -191,13 +202,13 @@ def train(
 ) -> tuple[Weights, dict[str, Any]]:
     """Train on sources of (trajectories, share); returns the weights and a log of loss, norms and drops.
 
-    folder: where checkpoints are kept; a run cut off there goes on from its last. start: weights to go on from instead
-    of fresh ones. seconds: only as many of the updates as fit into them, judged by the first. Where a hundred batches
-    in a row are dropped, the last good weights are returned and the log says so.
+    folder: where checkpoints are kept; a run cut off there goes on from its last. start: weights to go on from; what
+    they lack begins fresh. seconds: only as many of the updates as fit into them, judged by the first. Where a hundred
+    batches in a row are dropped, the last good weights are returned and the log says so.
     """
     random = np.random.default_rng(recipe.seed)
     scene, windows = model.scene, Windows(model.scene, sources, recipe)
-    weights = statistics_of(model, windows, random) if start is None else start
+    weights = begun(model, windows, random, start)
     transform = optimiser(recipe)
     fixed = {name: value for name, value in weights.networks.items() if not name.startswith(recipe.only or "")}
     trained = {name: value for name, value in weights.networks.items() if name not in fixed}

@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,6 +42,9 @@ from larp_model.soft_contact import Rule
 
 VERSION = 3
 SHIPPED = Path(__file__).parent / "weights"
+# Motors may be so much stronger or weaker than those of the training where mechanics is what says what they do: with
+# motors of 0.8 and 1.2 times the strength a human is predicted as well as with its own (tests/test_shipped.py).
+MOTORS = 0.2
 # What a manifest may speak of, by the name that it gives it.
 KINDS: dict[str, Any] = {
     "articulated": Articulated,
@@ -164,8 +167,12 @@ def save(
     return folder / f"{name}.json"
 
 
-def load(manifest: Path, scene: Scene) -> tuple[Model, Weights, dict[str, Any]]:
-    """The scene's model, its weights and the whole manifest; refuses what is missing, damaged or does not fit."""
+def load(manifest: Path, scene: Scene | None, partly: bool = False) -> tuple[Model, Weights, dict[str, Any]]:
+    """The scene's model, its weights and the whole manifest; refuses what is missing, damaged or does not fit.
+
+    scene: None for that which the parts were made for. partly: contacts of which the weights know nothing are left out
+    of the model, instead of refused.
+    """
     tensors_path = manifest.with_suffix(".safetensors")
     for path in (manifest, tensors_path):
         if not path.is_file():
@@ -180,6 +187,12 @@ def load(manifest: Path, scene: Scene) -> tuple[Model, Weights, dict[str, Any]]:
         raise ValueError(f"weights manifest {manifest} cannot be read: {type(error).__name__}: {error}") from None
     if not known:
         raise ValueError(f"weights {manifest} are of version {version!r}, but {VERSION} is needed")
+    scene = scene or scene_of(parts)
+    if partly:
+        names = {name_of(*bodies_of(part)) for part in parts}
+        both = zip(scene.pairs, ordered(scene), strict=True)
+        kept = tuple(pair for pair, (_, bodies) in both if name_of(*bodies) in names)
+        scene = dataclasses.replace(scene, pairs=kept)
     try:
         model = assemble(scene, parts)
     except ValueError as error:
@@ -196,12 +209,23 @@ def load(manifest: Path, scene: Scene) -> tuple[Model, Weights, dict[str, Any]]:
     return model, unflatten(arrays), content
 
 
+def scene_of(parts: Sequence[BodyPart | PairPart]) -> Scene:
+    """The scene that parts were made for."""
+    bodies = tuple(body for part in parts if not hasattr(part, "pair") for body in bodies_of(part))
+    order = [body.name for body in bodies]
+    pairs = (part.pair for part in parts if hasattr(part, "pair"))
+    named = (pair if order.index(pair.first) <= order.index(pair.second) else pair.flipped() for pair in pairs)
+    said = {name: value for part in parts for name in ("dt", "gravity") if (value := getattr(part, name, None))}
+    return Scene(bodies, tuple(named), **said)
+
+
 def differences(part: BodyPart | PairPart, scene: Scene, trained: Mapping[str, Trained]) -> Iterator[str]:
     """In what the scene, where it needs the part, is not what that was trained for, each in a few words."""
     for own in bodies_of(part):
         for body in scene.bodies:
             if body.kind == own.kind:
-                yield from _bodies_differ(body, own, trained[own.kind])
+                mechanical = isinstance(getattr(part, "base", None), OverMechanics | SoftContacts)
+                yield from _bodies_differ(body, own, trained[own.kind], MOTORS if mechanical else 0.0)
     for name in ("dt", "gravity"):
         was, now = getattr(part, name, None), getattr(scene, name)
         if was is not None and was != now:
@@ -214,16 +238,24 @@ def differences(part: BodyPart | PairPart, scene: Scene, trained: Mapping[str, T
             yield from _differ(f"the surface of {one} and {two}", pair.surface, part.pair.surface)
 
 
-def _bodies_differ(body: Body, own: Body, trained: Trained) -> Iterator[str]:
-    """Links' sizes may be any between those trained on."""
+def _bodies_differ(body: Body, own: Body, trained: Trained, slack: float) -> Iterator[str]:
+    """Links' sizes may be any between those trained on, motors stronger or weaker by a share of `slack`."""
     yield from _differ(f"{body.name}.links", len(body.links), len(own.links))
     for link, was in zip(body.links, own.links, strict=True):
         yield from _differ(f"{body.name}.{link.name}.axis", link.axis, was.axis)
         yield from _differ(f"the name of {body.name}.{link.name}", link.name, was.name)
     yield from beyond(body, trained)
     for joint, before, link in zip(body.joints, own.sized(body.sizes).joints, body.links[1:], strict=True):
+        if joint.motor and before.motor and _as_strong(joint.motor, before.motor, slack):
+            joint = dataclasses.replace(joint, motor=before.motor)
         yield from _differ(f"the joint of {body.name}.{link.name}", joint, before)
     yield from _differ(f"{body.name}.surface", body.surface, own.surface)
+
+
+def _as_strong(motor: Motor, was: Motor, slack: float) -> bool:
+    """Whether a motor is `Motor.times` of another by at most that share more or less."""
+    factor = motor.stiffness / was.stiffness
+    return abs(factor - 1.0) <= slack + 1e-6 and not list(_differ("", motor, was.times(factor)))
 
 
 def beyond(body: Body, trained: Trained) -> Iterator[str]:
@@ -242,6 +274,14 @@ def trained_sizes(content: Mapping[str, Any]) -> dict[str, Trained]:
         kind: Trained(*(np.array(sizes[name], float).reshape(-1, 3) for name in Trained._fields))
         for kind, sizes in content["trained on"].items()
     }
+
+
+def extremes(content: Mapping[str, Any], scene: Scene) -> np.ndarray:
+    """Morphologies (2, L, 3) of a scene: the smallest and the largest links that a manifest's weights know."""
+    known = trained_sizes(content)
+    return np.stack(
+        [np.concatenate([getattr(known[body.kind], end) for body in scene.bodies]) for end in Trained._fields]
+    )
 
 
 def _differ(what: str, now: Any, was: Any) -> Iterator[str]:

@@ -27,10 +27,9 @@ from larp_model.parts.part import Model
 from larp_model.simulator import Simulator
 from larp_model.truth import episodes as truth_episodes
 from larp_model.truth.episodes import Episodes
-from larp_model.weights import Trained
 from tasks.data import STEPS, WINDOWS, contact_episodes, random_episodes
 from tasks.kick import HEIGHT, learned_models, prepare, remember_compilations, run
-from tasks.scenarios import ANY_HUMAN, FULL_HUMAN
+from tasks.scenarios import ANY_HUMAN
 from tasks.train import IMPACTS, OVER_MECHANICS, planned_episodes
 
 # Episodes that weights are checked on, and those drawn at a time.
@@ -131,7 +130,7 @@ def main(
         left = max(0.0, whole - (time.perf_counter() - begin)) / 60.0
         console.print(f"{what}; {left:.1f} min left")
 
-    known_by = weights or stored.SHIPPED / f"{ANY_HUMAN if body == 'lean' else FULL_HUMAN}.json"
+    known_by = weights or stored.SHIPPED / f"{ANY_HUMAN[body]}.json"
     model, start, content = stored.load(known_by, human_and_ball(detail=body))
     kick = prepare(reference, height, mass=mass, names=names, detail=body)
     scene, known = kick.scene, stored.trained_sizes(content)
@@ -178,12 +177,8 @@ def main(
         "after": after._asdict(),
         "recipe": content["recipe"],
     }
-    sizes = np.stack(
-        [np.concatenate([getattr(known[body.kind], end) for body in scene.bodies]) for end in Trained._fields]
-    )
-    written = stored.save(
-        out, "adapted", model, learned if better else start, recipe, np.concatenate([sizes, scene.morphology[None]])
-    )
+    sizes = np.concatenate([stored.extremes(content, scene), scene.morphology[None]])
+    written = stored.save(out, "adapted", model, learned if better else start, recipe, sizes)
     console.print(f"weights: {written}; {time.perf_counter() - begin:.0f} s in all")
 
 

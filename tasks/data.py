@@ -94,7 +94,7 @@ def random_starts(
         above = clearance(body, states[:, rows], usual)
         states[:, rows] = closed(scene.only("human"), states[:, rows], sizes[:, rows])
         states[:, rows, 2] += (above - clearance(body, states[:, rows], sizes[:, rows]))[:, None]
-    for pair in scene.pairs:
+    for pair in scene.between.pairs:
         struck = scene.index(pair.second, pair.second_links[0])
         foot = scene.index("human", "right_foot")
         paths = larger * reference.states[begin[:, None] + np.arange(steps), foot, :3]
@@ -145,8 +145,9 @@ def random_places(
 
 def out_of_legs(scene: Scene, states: np.ndarray, morphology: np.ndarray | None = None) -> np.ndarray:
     """The states (N, L, 13), but what is inside a leg, no initial state, waits out of reach instead."""
-    states, struck = states.copy(), scene.index(scene.pairs[0].second, scene.pairs[0].second_links[0])
-    inside = overlaps(scene, states, morphology)
+    pair = scene.between.pairs[0]
+    states, struck = states.copy(), scene.index(pair.second, pair.second_links[0])
+    inside = overlaps(scene.between, states, morphology)
     states[inside, struck, :2] = (3.0, 0.0)
     states[inside, struck, 2] = resting(scene.links[struck], states[inside, struck])
     return states
@@ -159,8 +160,10 @@ def overlaps(scene: Scene, states: np.ndarray, morphology: np.ndarray | None = N
     """
     sizes = morphology_of(scene)[None] if morphology is None else jnp.asarray(morphology, jnp.float32)
     still = jnp.asarray(states)
-    gaps = [met.gap for _, met in meetings(scene, still, sizes)]
-    return np.asarray(jnp.concatenate(gaps, axis=1).min(axis=1) < 0.0)
+    lowest = np.full(len(states), np.inf)
+    for _, met in meetings(scene, still, sizes):
+        lowest = np.minimum(lowest, met.gap.min(axis=1))
+    return lowest < 0.0
 
 
 def turned_about_z(states: np.ndarray, angle: np.ndarray) -> np.ndarray:
@@ -180,11 +183,16 @@ def random_episodes(
 ) -> tuple[Episodes, int]:
     """Episodes from `random_starts` under the reference's targets plus smooth noise; some with pushes from outside.
 
-    varied: every human is another one. Returns them and how many diverged and were dropped.
+    varied: every human is another one. Returns them, and how many were dropped because they began with one leg in the
+    other, or diverged.
     """
     random = np.random.default_rng(seed)
     sizes = random_people(np.random.default_rng((seed, 1)), scene, count) if varied else None
     states, begin = random_starts(random, scene, reference, count, steps, sizes)
+    apart = ~overlaps(scene, states, sizes)  # no initial state has one leg in the other
+    states, begin, tangled = states[apart], begin[apart], int((~apart).sum())
+    count -= tangled
+    sizes = None if sizes is None else sizes[apart]
     rows = np.minimum(begin[:, None] + np.arange(steps), len(reference.controls) - 1)
     size = random.uniform(0.0, 1.2, (count, 1, 1, 1))
     controls = reference.controls[rows] + size * smooth_noise(random, count, steps, 8, stray(scene))
@@ -192,7 +200,8 @@ def random_episodes(
     upper = np.array([motor.upper for motor in scene.motors])
     controls = np.clip(controls, lower, upper)
     torques = pushes(random, scene, count, steps)
-    return record(Truth(scene, batch=min(count, 256)), states, controls, torques, sizes)
+    episodes, diverged = record(Truth(scene, batch=min(count, 256)), states, controls, torques, sizes)
+    return episodes, tangled + diverged
 
 
 def pushes(random: np.random.Generator, scene: Scene, count: int, steps: int) -> np.ndarray:
@@ -213,13 +222,13 @@ def contact_episodes(
     Returns them and how many diverged and were dropped.
     """
     random = np.random.default_rng(seed)
-    contacts = first_contacts(scene, source)
+    contacts = first_contacts(scene.between, source)
     # In order, so that a body is built once for all its episodes.
     rows = np.sort(random.choice(np.flatnonzero((contacts >= 0) & (contacts + steps <= source.steps)), count))
     begin = np.maximum(contacts[rows] - random.integers(0, 4, count), 0)
     states, sizes = source.states[rows, begin].astype(float), source.morphology[rows]
     columns = begin[:, None] + np.arange(steps)
-    human, pair = scene.rows("human"), scene.pairs[0]
+    human, pair = scene.rows("human"), scene.between.pairs[0]
     struck = scene.index(pair.second, pair.second_links[0])
     size = random.uniform(0.0, 1.0, (count, 1, 1))
     states[:, human, packed.ANGULAR_VELOCITY] += 2.0 * size * random.standard_normal(states[:, human, 10:].shape)

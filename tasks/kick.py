@@ -60,7 +60,7 @@ from tasks.motions import references
 from tasks.motions.bvh import names_in
 from tasks.motions.references import Reference
 from tasks.presets import Preset, preset_of, usable
-from tasks.scenarios import ANY_HUMAN, FULL_HUMAN
+from tasks.scenarios import ANY_HUMAN
 from tasks.standing import Standing
 from viewer import LivePage, Recording, kick_picture, nearest_approach, write_html
 
@@ -299,10 +299,8 @@ def miss(path: np.ndarray, target: np.ndarray) -> float:
 
 def shipped(scene: Scene, reference: Path | None) -> Path:
     """The manifest of the shipped weights for a kick: of the embedded one, or of any human in any motion."""
-    if detail_of(scene.bodies[0]) == "full":
-        return stored.SHIPPED / f"{FULL_HUMAN}.json"
     embedded = reference is None and scene == human_and_ball()
-    return stored.SHIPPED / f"{WEIGHTS if embedded else ANY_HUMAN}.json"
+    return stored.SHIPPED / f"{WEIGHTS if embedded else ANY_HUMAN[detail_of(scene.bodies[0])]}.json"
 
 
 def models_of(scene: Scene, name: DynamicsName, weights: Path, substeps: int = SUBSTEPS, rows: int = ROWS) -> Models:
@@ -319,7 +317,7 @@ def models_of(scene: Scene, name: DynamicsName, weights: Path, substeps: int = S
     found = learned_models(scene, model, learned, manifest["sha256"][:12])
     if weights != stored.SHIPPED / f"{WEIGHTS}.json":
         return found
-    any_human, motion, _ = stored.load(stored.SHIPPED / f"{ANY_HUMAN}.json", _parts(scene)[2])
+    any_human, motion, _ = stored.load(stored.SHIPPED / f"{ANY_HUMAN['lean']}.json", _parts(scene)[2])
     return found._replace(human=Simulator(any_human, motion))
 
 
@@ -436,15 +434,16 @@ def prepare(
     mass: float | None = None,
     names: Path | None = None,
     detail: Detail = "lean",
+    self_contact: bool = False,
 ) -> Kick:
     """The kick's scene with its reference: the embedded one, or a captured one from a BVH or an npz file.
 
     height: of the human [m]. substeps: engine steps of the truth in a step. mass: of the human [kg]; as heavy as its
-    height squared by default. names: JSON file of what a BVH file calls our joints; see `bvh.load`. detail: of the
-    human; see `bodies.human`.
+    height squared by default. names: JSON file of what a BVH file calls our joints; see `bvh.load`. detail,
+    self_contact: see `bodies.human_and_ball`.
     """
     heavy = MASS * (height / HEIGHT) ** 2 if mass is None else mass
-    scene = human_and_ball(height=height, mass=heavy, detail=detail)
+    scene = human_and_ball(height=height, mass=heavy, detail=detail, self_contact=self_contact)
     return kick_of(scene, body_reference, substeps, names)
 
 
@@ -470,6 +469,7 @@ def main(
     height: float = HEIGHT,
     mass: float | None = None,
     body: Detail = "lean",
+    self_contact: bool = False,
     seed: int = 0,
     out: Path = Path("runs/kick"),
     view: bool = False,
@@ -487,6 +487,7 @@ def main(
         height: of the human [m].
         mass: of the human [kg]; as heavy as its height squared by default.
         body: lean: 13 links; full: 26, with a spine, hands and toes.
+        self_contact: let one leg touch the other, below the knee; else they pass through each other.
         seed: of the planner's random numbers.
         out: folder for summary.json, kick.npz, kick.png and kick.html.
         view: show the kick live in the browser, on 127.0.0.1.
@@ -498,7 +499,7 @@ def main(
     chosen = preset_of(preset)
     require_writable(out, "out")
     remember_compilations()
-    kick = prepare(reference, height, mass=mass, names=names, detail=body)
+    kick = prepare(reference, height, mass=mass, names=names, detail=body, self_contact=self_contact)
     models = models_of(kick.scene, dynamics, weights or shipped(kick.scene, reference))  # type: ignore[arg-type]
     planners = planners_of(kick, chosen, models)
     page = LivePage(port=port) if view else None

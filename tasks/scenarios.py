@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from larp_model.anatomy import KINDS
+from larp_model.anatomy import KINDS, Detail
 from larp_model.bodies import chain, detail_of, human_and_ball, human_and_capsule, two_balls, two_chains
 from larp_model.designs import DesignName, SizeName
 from larp_model.scene import Scene
@@ -18,10 +18,8 @@ from tasks.motions.generator import any_episodes
 from tasks.thrown import thrown_episodes
 
 CHAIN_WINDOWS = (10, 40, 80, 190)
-# The scenario, and the weights, of humans of every size in any motion.
-ANY_HUMAN = "any_human"
-# The same of the human in full detail.
-FULL_HUMAN = "full_human"
+# The scenarios, and the weights, of humans of every size in any motion.
+ANY_HUMAN: dict[Detail, str] = {"lean": "any_human", "full": "full_human"}
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ def _any_human(scene: Scene, count: int, seed: int) -> tuple[Episodes, int]:
 
 
 def _human(name: str, scene: Scene, *paper: tuple[str, tuple[float, ...]]) -> Scenario:
-    return Scenario(name, scene, partial(_around_the_kick, scene), WINDOWS, bool(scene.pairs), paper)
+    return Scenario(name, scene, partial(_around_the_kick, scene), WINDOWS, bool(scene.between.pairs), paper)
 
 
 def _any(name: str, scene: Scene) -> Scenario:
@@ -80,8 +78,8 @@ SCENARIOS = {
             "human_capsule", human_and_capsule(), ("human", (0.010, 0.031, 0.050)), ("capsule", (0.010, 0.042, 0.069))
         ),
         _human("human", human_and_ball().only("human")),
-        _any(ANY_HUMAN, human_and_ball()),
-        _any(FULL_HUMAN, human_and_ball(detail="full")),
+        _any(ANY_HUMAN["lean"], human_and_ball(self_contact=True)),
+        _any(ANY_HUMAN["full"], human_and_ball(detail="full")),
         _thrown("chain4", Scene((chain(links=4),))),
         _thrown("chains1", two_chains(1), 0.008, 0.021, 0.048, 0.173),
         _thrown("chains2", two_chains(2), 0.007, 0.023, 0.047, 0.137),

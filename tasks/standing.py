@@ -50,6 +50,7 @@ class Standing:
         human = scene.bodies[0]
         self.human = scene.rows(human.name)
         self.feet = np.array([human.link("left_foot"), human.link("right_foot")])
+        self.trunk = np.array([human.link("pelvis"), human.link("torso")])
         self.lying = np.array([human.links[foot].radius for foot in self.feet], np.float32)
         self.height = standing_height(human)
         mass = np.array([link.mass for link in human.links], np.float32)
@@ -75,7 +76,7 @@ class Standing:
             return context["settled"][:, None] * jnp.maximum(above, 0.0)
 
         def lean(states: Array, controls: Array, context: Any) -> Array:
-            up = rotation.matrix(packed.orientation(states[:, :2]))[..., :2, 2]
+            up = rotation.matrix(packed.orientation(states[:, self.trunk]))[..., :2, 2]
             return up.reshape(len(states), -1)
 
         return (

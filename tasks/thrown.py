@@ -76,7 +76,7 @@ def thrown_episodes(
     else:
         morphology = np.broadcast_to(scene.morphology, (2 * count, len(scene.links), 3))
     states = thrown_starts(random, scene, morphology)
-    apart = np.flatnonzero(~overlaps(scene, states, morphology) if scene.pairs else np.ones(2 * count, bool))[:count]
+    apart = np.flatnonzero(~overlaps(scene, states, morphology))[:count]
     states, morphology = states[apart], morphology[apart]
     torques = np.zeros((len(states), steps, len(scene.links), 3))
     for body in scene.bodies:

@@ -47,11 +47,15 @@ LOSS = LossWeights(velocity=1e-2, far=0.05, fast=0.1, arm=0.14)
 
 
 class Stage(NamedTuple):
-    """A part of the training: what it is called, which episodes it adds first, if any, and how it trains."""
+    """A part of the training: what it is called, which episodes it adds first, if any, and how it trains.
+
+    uses: beginnings of the names of the episodes that it trains on; all by default.
+    """
 
     name: str
     adds: Literal["", "planned", "contacts"]
     recipe: training.Recipe
+    uses: tuple[str, ...] = ("",)
 
 
 # Single steps around contacts teach impacts, at a twentieth of a rollout's price; rollouts teach the human to stay
@@ -78,6 +82,13 @@ GENERAL = (Stage("steps", "", OVER_MECHANICS),)
 # like the push.
 STRIKING_BALLS = (*GENERAL, Stage("impacts", "", IMPACTS))
 STRIKING = (*GENERAL, Stage("impacts", "", replace(IMPACTS, only=("contact", "response"), loss=LOSS)))
+# One leg on the other, the body's own motion left as it is.
+LEGS = (
+    Stage(
+        "legs", "", replace(OVER_MECHANICS, updates=2500, contact_share=0.9, before_contact=1, after_contact=8,
+        within=True, only=("contact/human-itself",)), uses=("random",),
+    ),
+)  # fmt: skip
 # Algorithm 1 of the paper, with its losses; in small batches, which are the most updates that two cores give. Where the
 # unroll grows by more at once, what worked for a few steps runs away within more.
 GROWING = ((2, 0.1), (3, 0.05), (4, 0.05), (6, 0.1), (8, 0.1), (11, 0.1), (14, 0.1), (17, 0.1), (20, 0.3))
@@ -96,9 +107,14 @@ KICK = (
 
 def stages_of(chosen: Scenario) -> tuple[Stage, ...]:
     """How the weights of a scene are trained over mechanics."""
+    scene = chosen.scene
     if not chosen.strikes:
         return GENERAL
-    return STRIKING_BALLS if any(chosen.scene.body(pair.second).is_ball for pair in chosen.scene.pairs) else STRIKING
+    balls = any(scene.body(pair.second).is_ball for pair in scene.pairs)
+    return (
+        *(STRIKING_BALLS if balls else STRIKING),
+        *(LEGS if scene.within.pairs else ()),
+    )
 
 
 def planned_episodes(
@@ -146,7 +162,7 @@ def stored_episodes(path: Path, scene: Scene, make: Callable[[], tuple[Episodes,
         episodes, dropped = make()
         truth_episodes.save(path, scene, episodes)
         seconds = time.perf_counter() - begin
-        console.print(f"{path.name}: {len(episodes.states)} episodes, {dropped} diverged, {seconds:.0f} s")
+        console.print(f"{path.name}: {len(episodes.states)} episodes, {dropped} dropped, {seconds:.0f} s")
     return truth_episodes.load(path, scene)
 
 
@@ -160,6 +176,7 @@ def main(
     tasks: int = 30,
     effort: float = 1.0,
     seed: int = 100,
+    start: Path | None = None,
 ) -> None:
     """Train the learned simulator of a scene.
 
@@ -174,6 +191,7 @@ def main(
         tasks: kicks planned for the candidates of each stage that adds some.
         effort: multiplies the updates of every stage.
         seed: of the data and the training; the benchmarks use seeds below 100.
+        start: manifest of weights to go on from: stages that they have been through are left out.
     """
     console, chosen = Console(), scenario(scene)
     folder = folder or trained_at(chosen.name, design, size)
@@ -188,35 +206,46 @@ def main(
     else:
         model = designs.DESIGNS[design](chosen.scene)
     random = stored_episodes(folder / "random.npz", chosen.scene, lambda: chosen.draw(episodes, seed), console)
-    sources = [random]
-    if chosen.strikes:
-        near = partial(contact_episodes, chosen.scene, random, CONTACTS * episodes, seed + 1)
-        sources.append(stored_episodes(folder / "contacts.npz", chosen.scene, near, console))
+    sources = {"random": random}
+
+    def add(name: str, make: Callable[[], tuple[Episodes, int]]) -> None:
+        sources[name] = stored_episodes(folder / f"{name}.npz", chosen.scene, make, console)
+
     learned: Weights | None = None
+    sizes = random.morphology
     rounds: list[dict[str, Any]] = []
+    if start:
+        _, learned, content = stored.load(start, chosen.scene, partly=True)
+        rounds = content["recipe"]["rounds"]
+        sizes = np.concatenate([sizes, stored.extremes(content, chosen.scene)])
+    done = {each["stage"] for each in rounds}
+    if chosen.strikes and any("contacts".startswith(stage.uses) for stage in stages if stage.name not in done):
+        add("contacts", partial(contact_episodes, chosen.scene, random, CONTACTS * episodes, seed + 1))
     manifest = Path()
 
     def save(into: Path, recipe: dict[str, Any]) -> Path:
         assert learned is not None
-        return stored.save(into, chosen.name, model, learned, recipe, random.morphology)
+        return stored.save(into, chosen.name, model, learned, recipe, sizes)
 
     for number, stage in enumerate(stages):
+        if stage.name in done:
+            continue
+        later = seed + 1000 * number
         if stage.adds and kick is not None and learned is not None:
             models = learned_models(chosen.scene, model, learned, stage.name)
-            later = seed + 1000 * number
+            last = [*sources.values()][-1]
             makers = {
                 "planned": partial(planned_episodes, kick, models, tasks, 8, later),
-                "contacts": partial(on_policy_contacts, chosen.scene, random, sources[-1], 2 * episodes, later),
+                "contacts": partial(on_policy_contacts, chosen.scene, random, last, 2 * episodes, later),
             }
-            path = folder / f"{stage.name}.npz"
-            sources.append(stored_episodes(path, chosen.scene, makers[stage.adds], console))
+            add(stage.name, makers[stage.adds])
         manifest = folder / stage.name / f"{chosen.name}.json"
         if manifest.exists():
             _, learned, content = stored.load(manifest, chosen.scene)
             rounds = content["recipe"]["rounds"]
             continue
         longest = max(steps for steps, _ in stage.recipe.curriculum)
-        used = [(source, 1.0) for source in sources if source.steps >= longest]
+        used = [(each, 1.0) for name, each in sources.items() if name.startswith(stage.uses) and each.steps >= longest]
         updates = max(1, round(effort * stage.recipe.updates))
         recipe = replace(stage.recipe, updates=updates, seed=seed + number)
         learned, log = training.train(model, recipe, used, folder / stage.name, learned)

@@ -29,7 +29,7 @@ def manifest(tmp_path_factory: pytest.TempPathFactory) -> Path:
     episodes, _ = random_episodes(SCENE, prepare().reference, 64, 3)
     windows = training.Windows(SCENE, [(episodes, 1.0)], OVER_MECHANICS)
     weights = training.statistics_of(model, windows, np.random.default_rng(0), batches=1)
-    return stored.save(folder, ANY_HUMAN, model, weights, {})
+    return stored.save(folder, ANY_HUMAN["lean"], model, weights, {})
 
 
 def test_smaller_errors_are_better_and_the_same_are_not() -> None:

@@ -73,7 +73,8 @@ def test_a_description_refuses_nonsense_by_field(description: Link, field: str, 
         (lambda: Scene((human(), ball()), (dataclasses.replace(PAIR, second_links=()),)), "'ball', but needs some"),
         (lambda: Scene((human(), ball()), (dataclasses.replace(PAIR, second_links=("ball", "ball")),)), "each once"),
         (lambda: Scene((human(), ball()), (PAIR, Pair("ball", "human", ("ball",), ("head",), SURFACE))), "together"),
-        (lambda: Scene((ball(),), (Pair("ball", "ball", ("ball",), ("ball",), SURFACE),)), "'ball' twice"),
+        (lambda: Scene((ball(),), (Pair("ball", "ball", ("ball",), ("ball",), SURFACE),)), "'ball' .* are one link"),
+        (lambda: Scene((human(),), (Pair("human", "human", ("head",), ("torso",), SURFACE),)), "'head' and 'torso'"),
         (lambda: human_and_ball().only("robot"), "no body 'robot'"),
         (lambda: human_and_ball().index("human", "paw"), "no link 'paw'"),
         (lambda: Surface.bouncing(0.0, 0.8, 0.5), "contact_time is 0.0"),
@@ -88,6 +89,7 @@ def test_a_description_refuses_nonsense_by_field(description: Link, field: str, 
         (lambda: human(lengths={"tail": 1.0}), "lengths names 'tail'"),
         (lambda: human(radii={"shin": 0.0}), "radii"),
         (lambda: human(lengths={"toes": 1.0}), "lengths names 'toes'"),
+        (lambda: human(motors={"tail": 1.0}), "motors names 'tail'"),
         (lambda: human(detail="fine"), "detail is 'fine', but must be one of lean, full"),  # type: ignore[arg-type]
         (lambda: detail_of(ball()), "'ball' is a ball, but must be one of human, full_human"),
         (lambda: human_and_ball(dt=-0.01), "dt is -0.01"),
@@ -116,6 +118,14 @@ def test_rows_of_bodies_tile_the_state_and_the_control() -> None:
         assert scene.index("human", link.name) == row
     for child, parent, joint in scene.joints():
         assert parent < child and joint in next(b for b in scene.bodies if scene.links[child] in b.links).joints
+
+
+def test_contacts_of_a_body_with_itself_are_told_from_those_of_two() -> None:
+    scene, without = human_and_ball(self_contact=True), human_and_ball()
+    assert scene.between == without and without.within.pairs == ()
+    [legs] = scene.within.pairs
+    assert legs.of_itself and set(legs.first_links) == {"left_shin", "left_foot"}
+    assert scene.only("human").pairs == (legs,) and scene.only("ball").pairs == ()
 
 
 def test_only_keeps_the_bodies_named_and_their_pairs() -> None:
@@ -220,6 +230,16 @@ def test_segments_are_scaled_by_name(detail: Detail, factor: float) -> None:
         assert after.length == pytest.approx(before.length * (factor if before.name.endswith("thigh") else 1.0))
         assert after.radius == pytest.approx(before.radius * (factor if before.name.endswith("foot") else 1.0))
         assert after.mass == before.mass
+
+
+@IN_DETAIL
+@given(FACTOR)
+def test_motors_are_scaled_by_name_beyond_their_proportion(detail: Detail, factor: float) -> None:
+    body, scaled = human(height=1.6, detail=detail), human(height=1.6, motors={"shin": factor}, detail=detail)
+    assert scaled.links == body.links
+    for (child, _, motor), (_, _, before) in zip(scaled.motors, body.motors, strict=True):
+        shin = body.links[child].name.endswith("shin")
+        assert motor == (before.times(factor) if shin else before)
 
 
 def test_a_ball_is_the_only_body_without_a_direction() -> None:

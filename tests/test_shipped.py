@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from larp_model import evaluation
 from larp_model import state as packed
 from larp_model import weights as stored
+from larp_model.bodies import human, human_and_ball, segment_of
 from larp_model.simulator import Simulator
+from tasks.data import random_episodes
+from tasks.motions.references import Reference
 from tasks.scenarios import scenario
 
 
@@ -61,3 +66,17 @@ def test_the_shipped_human_and_what_it_strikes_err_no_more_than_they_did(
     launch = evaluation.launch(simulator, given, 3)
     assert launch["count"] > 10
     assert launch["relative_error"]["median"] < launched[0] and launch["angle_deg"]["median"] < launched[1]
+
+
+def test_a_human_whose_motors_are_stronger_and_weaker_is_foreseen_as_well(reference: Reference) -> None:
+    usual, random = human_and_ball(), np.random.default_rng(2)
+    names = sorted({segment_of(link.name) for link in usual.body("human").links})
+    factors = dict(zip(names, random.choice([0.8, 1.2], len(names)).tolist(), strict=True))
+    scene = replace(usual, bodies=(human(motors=factors), usual.body("ball")))
+    model, learned, _ = stored.load(stored.SHIPPED / "any_human.json", scene)
+    given, _ = random_episodes(scene, reference, 32, 3, steps=38)
+    predicted = evaluation.predict(
+        Simulator(model, learned), given.states[:, 0], given.controls, given.torques, given.morphology
+    )
+    distance, kept = evaluation.distances(predicted, given, 38)
+    assert kept.all() and distance[:, :, scene.rows("human")].mean() < 0.02

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from larp_model import designs
-from larp_model.bodies import ball, capsule, human_and_ball, human_and_capsule
+from larp_model.bodies import ball, capsule, human, human_and_ball, human_and_capsule
 from larp_model.networks import Weights
 from larp_model.parts.part import Model, initial_weights, measure
 from larp_model.scene import Body, Scene
-from larp_model.weights import VERSION, load, save
+from larp_model.weights import SHIPPED, VERSION, load, save
 
 
 @pytest.fixture
@@ -140,6 +140,17 @@ def test_links_of_any_size_that_was_trained_on_are_taken(
     larger = load(manifest, scene.sized(1.2 * scene.morphology))[0]
     assert larger.bodies[0].body.links[0].length == pytest.approx(1.2 * scene.links[0].length)
     assert "but they were trained on" in refusal(manifest, scene.sized(1.6 * scene.morphology))
+
+
+def test_motors_may_differ_where_mechanics_says_what_they_do_and_not_where_it_is_learned(stored: Path) -> None:
+    def strong(factor: float) -> Scene:
+        return replace(human_and_ball(), bodies=(human(motors={"thigh": factor}), human_and_ball().bodies[1]))
+
+    shipped = SHIPPED / "any_human.json"
+    for factor in (0.8, 1.2):
+        assert load(shipped, strong(factor))[0].scene == strong(factor)
+    assert "left_thigh.motor.stiffness is 1170" in refusal(shipped, strong(1.3))
+    assert "left_thigh.motor.stiffness is 990" in refusal(stored, strong(1.1))
 
 
 def flip(content: bytes, place: float) -> bytes:

@@ -171,7 +171,9 @@ def initial_weights(model: Model, key: Array, statistics: Measured) -> Weights:
 
 
 def name_of(*bodies: Body) -> str:
-    """How the kinds of these bodies are called in the names of networks."""
+    """How the kinds of these bodies are called in the names of networks; one with itself is no two of a kind."""
+    if len(bodies) == 2 and bodies[0] == bodies[1]:
+        return f"{bodies[0].kind}-itself"
     return "-".join(body.kind for body in bodies)
 
 

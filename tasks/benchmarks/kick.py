@@ -116,6 +116,7 @@ def main(
     height: float = HEIGHT,
     bodies: Literal["usual", "varied"] = "usual",
     body: Detail = "lean",
+    self_contact: bool = False,
     rolling: float = 0.0,
     noise: bool = False,
     budget: float | None = None,
@@ -135,6 +136,7 @@ def main(
         height: of the human [m].
         bodies: varied: every kick is another human's, of any size.
         body: lean: 13 links; full: 26, with a spine, hands and toes.
+        self_contact: let one leg touch the other.
         rolling: greatest speed [m/s] of a ball that comes from ahead or from the kicking side; 0: it rests.
         noise: show the planner the state with sensing noise.
         budget: seconds for the first plan, and a fifth of them for each replan; the preset is scaled to fit.
@@ -153,6 +155,7 @@ def main(
         "height": f"{height:g}" if height != HEIGHT else "",
         "bodies": bodies if bodies != "usual" else "",
         "body": body if body != "lean" else "",
+        "self_contact": "on" if self_contact else "",
         "rolling": f"{rolling:g}" if rolling else "",
         "noise": "on" if noise else "",
         "budget": f"{budget:g}" if budget is not None else "",
@@ -169,7 +172,7 @@ def main(
         fitting = chosen if budget is None else within(chosen, budget, partial(seconds_of, kick, models))
         return kick, models, planners_of(kick, fitting, models)
 
-    usual = prepare(reference, height, substeps, detail=body)
+    usual = prepare(reference, height, substeps, detail=body, self_contact=self_contact)
     people = random_people(np.random.default_rng((seed, 1)), usual.scene, targets)
     always = planned(usual) if bodies == "usual" else None
     random = np.random.default_rng(seed)
@@ -196,7 +199,11 @@ def main(
     command = (
         f"python -m tasks.benchmarks.kick --targets {targets} --seed {seed} --preset {preset} --dynamics {dynamics}"
     )
-    flags = {"reference": f"--reference {reference.name if reference else ''}", "noise": "--noise"}
+    flags = {
+        "reference": f"--reference {reference.name if reference else ''}",
+        "self_contact": "--self-contact",
+        "noise": "--noise",
+    }
     command = " ".join([command, *(flags.get(option, f"--{option} {value}") for option, value in said.items())])
     rows = report.collect(json, command, jobs)
     figures = summarise(rows)

@@ -10,7 +10,7 @@ from larp_model import state as packed
 from larp_model.scene import Body, Scene
 from larp_model.truth.episodes import Episodes, record
 from larp_model.truth.mujoco import Truth, closed
-from tasks.data import STEPS, out_of_legs, pushes, random_places, smooth_noise, stray, turned_about_z
+from tasks.data import STEPS, out_of_legs, overlaps, pushes, random_places, smooth_noise, stray, turned_about_z
 from tasks.motions import styles
 from tasks.motions.details import in_detail
 from tasks.motions.people import random_people
@@ -27,8 +27,8 @@ COARSE = 5
 def any_episodes(scene: Scene, reference: Reference, count: int, seed: int, steps: int = STEPS) -> tuple[Episodes, int]:
     """Episodes of humans of every size in motion, under their targets plus smooth noise; some with pushes from outside.
 
-    What the human may strike, if anything, waits where a foot will pass, or comes from anywhere. Returns them and how
-    many diverged and were dropped.
+    What the human may strike, if anything, waits where a foot will pass, or comes from anywhere. Returns
+    them, and how many were dropped because they began with one leg in the other, or diverged.
     """
     random = np.random.default_rng(seed)
     sizes = random_people(random, scene, count)
@@ -36,15 +36,19 @@ def any_episodes(scene: Scene, reference: Reference, count: int, seed: int, step
     noise = smooth_noise(random, count, steps, 8, stray(scene))
     targets += random.uniform(0.0, 1.2, (count, 1, 1, 1)) * noise
     targets = np.clip(targets, *styles.limits(scene.body("human")))
-    for pair in scene.pairs:
+    for pair in scene.between.pairs:
         struck = scene.index(pair.second, pair.second_links[0])
         paths = feet(random, scene, states, targets, sizes)
         middle = paths[:, steps // 2, :2]
         states[:, struck] = random_places(random, scene.links[struck], middle, paths, scene.dt)
         states = out_of_legs(scene, states, sizes)
+    apart = ~overlaps(scene, states, sizes)  # no initial state has one leg in the other
+    states, targets, sizes, tangled = states[apart], targets[apart], sizes[apart], int((~apart).sum())
+    count -= tangled
     states = turned_about_z(states, random.uniform(-np.pi, np.pi, count))
     torques = pushes(random, scene, count, steps)
-    return record(Truth(scene, batch=min(count, 256)), states, targets, torques, sizes)
+    episodes, diverged = record(Truth(scene, batch=min(count, 256)), states, targets, torques, sizes)
+    return episodes, tangled + diverged
 
 
 def in_motion(
