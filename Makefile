@@ -56,6 +56,7 @@ bench: $(READY)
 	$(MODEL) --scene any_human --seed 2
 	$(MODEL) --scene human_ball --weights larp_model/weights/any_human.json --seed 2
 	$(MODEL) --scene human_ball --weights larp_model/weights/any_human.json --seed 2 --bodies varied
+	$(MODEL) --scene full_human --seed 2 --bodies varied
 	$(RUN) tasks.benchmarks.gap --targets 8 --seed 7 --publish
 	for preset in fast balanced accurate; do $(RUN) tasks.benchmarks.kick --publish --targets 64 --seed 11 --preset $$preset || exit; done
 	for preset in fast balanced accurate; do $(KICK) --targets 32 --preset $$preset --substeps 20 || exit; done
@@ -66,6 +67,7 @@ bench: $(READY)
 	$(KICK) --targets 32 --rolling 2
 	for height in 1.6 1.9; do $(KICK) --height $$height || exit; done
 	$(KICK) --targets 32 --bodies varied
+	$(KICK) --body full
 
 # Keeps runs/: results are never thrown away by a clean-up.
 clean:

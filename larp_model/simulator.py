@@ -7,6 +7,7 @@ parts of a `Model`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from larp_model import state as packed
+from larp_model import weights as stored
 from larp_model.kinematics import Kinematics, kinematics, morphology_of
 from larp_model.meeting import Velocities
 from larp_model.networks import Weights
@@ -68,6 +70,15 @@ class Simulator:
 
     differentiable = True
 
+    @staticmethod
+    def load(weights: str | Path, scene: Scene | None = None) -> Simulator:
+        """The simulator of weights by their manifest, or of shipped ones by their name ("human_ball", "chains2", ...).
+
+        scene: that is to be simulated; what the weights were trained on by default.
+        """
+        manifest = stored.SHIPPED / f"{weights}.json" if Path(weights).name == str(weights) else Path(weights)
+        return Simulator(*stored.load(manifest, scene)[:2])
+
     @property
     def scene(self) -> Scene:
         """What is simulated."""
@@ -79,15 +90,15 @@ class Simulator:
         return step(self.model, self.weights, *given)
 
     def rollout(
-        self, state: Array, controls: Array, steps: Array | None = None, torques: Array | None = None,
-        morphology: Array | None = None,
+        self, state: Array, controls: Array, torques: Array | None = None, morphology: Array | None = None,
+        steps: Array | None = None,
     ) -> Array:  # fmt: skip
         """States (N, H, L, 13) after each of H steps from states (N, L, 13) under controls (N, H, J, 3) [rad].
 
         From where a trajectory diverges it holds NaN: see `state.healthy`.
 
-        steps (): so many of the H are computed, the rest repeat the last; all by default. torques: external, (N, H, L,
-        3) [N m]. morphology (N or 1, L, 3); the scene's by default. All are taken in the state's precision, 32
+        torques: external, (N, H, L, 3) [N m]. morphology (N or 1, L, 3); the scene's by default. steps (): so many of
+        the H are computed, the rest repeat the last; all by default. All are taken in the state's precision, 32
         or 64 bits. Positions in 32 bits are 0.1 mm apart 1 km from the origin: plan near it.
         """
         given = self._checked(state, controls, torques, morphology, np.shape(controls)[1:2])
@@ -122,7 +133,7 @@ class Simulator:
 
 def rollout(
     model: Model, weights: Weights, state: Array, controls: Array, torques: Array | None = None,
-    morphology: Array | None = None, stop_gradient: bool = False, steps: Array | None = None,
+    morphology: Array | None = None, steps: Array | None = None, stop_gradient: bool = False,
 ) -> Array:  # fmt: skip
     """States (B, H, L, 13) after each of H steps; the arguments are those of `step`, with a time axis second.
 

@@ -15,7 +15,7 @@ class Dynamics(Protocol):
     def differentiable(self) -> bool:
         """Whether JAX can differentiate `rollout`."""
 
-    def rollout(self, state: jax.Array, controls: jax.Array, steps: jax.Array | None = None) -> jax.Array:
+    def rollout(self, state: jax.Array, controls: jax.Array, *, steps: jax.Array | None = None) -> jax.Array:
         """States (N, H', L, 13) after steps 1 to H' >= H, from state (N, L, 13), controls (N, H, J, 3) [rad].
 
         Pure, traceable by JAX, and every row independent of the others. A row that diverged holds NaN. steps (): only
@@ -45,7 +45,7 @@ class MujocoDynamics:
     truth: BatchedTruth
     differentiable = False
 
-    def rollout(self, state: jax.Array, controls: jax.Array, steps: jax.Array | None = None) -> jax.Array:
+    def rollout(self, state: jax.Array, controls: jax.Array, *, steps: jax.Array | None = None) -> jax.Array:
         """See `Dynamics.rollout`; H' = H."""
         shape = (*controls.shape[:2], *state.shape[1:])
         result = jax.ShapeDtypeStruct(shape, jnp.float32)
@@ -86,9 +86,9 @@ class Continued:
         """True where both models are differentiable."""
         return self.dynamics.differentiable and self.tail.differentiable
 
-    def rollout(self, state: jax.Array, controls: jax.Array, steps: jax.Array | None = None) -> jax.Array:
+    def rollout(self, state: jax.Array, controls: jax.Array, *, steps: jax.Array | None = None) -> jax.Array:
         """See `Dynamics.rollout`; H' = H + `self.steps`."""
-        states = self.dynamics.rollout(state, controls, *(() if steps is None else (steps,)))
+        states = self.dynamics.rollout(state, controls, **({} if steps is None else {"steps": steps}))
         last = states[:, -1]
         followed = self.tail.rollout(last[:, self.links], jnp.zeros((len(state), self.steps, 0, 3)))
         frozen = jnp.repeat(last[:, None], self.steps, axis=1)

@@ -56,7 +56,7 @@ class Equations:
         """States (N, H', L, 13) and controls (N, H, J, 3) of knots (N, K, J, 3)."""
         controls = jax.vmap(self.controls, (0, None))(knots, wanted.reference)
         start = jnp.broadcast_to(wanted.state, (len(knots), *wanted.state.shape))
-        return dynamics.rollout(start, controls, *([] if wanted.steps is None else [wanted.steps])), controls
+        return dynamics.rollout(start, controls, **({} if wanted.steps is None else {"steps": wanted.steps})), controls
 
     def weigh(
         self, wanted: Wanted, states: jax.Array, controls: jax.Array, corrections: Any

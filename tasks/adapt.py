@@ -27,9 +27,12 @@ from larp_model.parts.part import Model
 from larp_model.simulator import Simulator
 from larp_model.truth import episodes as truth_episodes
 from larp_model.truth.episodes import Episodes
+from tasks.command import remember_compilations, run
 from tasks.data import STEPS, WINDOWS, contact_episodes, random_episodes
-from tasks.kick import HEIGHT, learned_models, prepare, remember_compilations, run
+from tasks.kick import Kick
+from tasks.models import learned_models
 from tasks.scenarios import ANY_HUMAN
+from tasks.task import HEIGHT
 from tasks.train import IMPACTS, OVER_MECHANICS, planned_episodes
 
 # Episodes that weights are checked on, and those drawn at a time.
@@ -132,7 +135,7 @@ def main(
 
     known_by = weights or stored.SHIPPED / f"{ANY_HUMAN[body]}.json"
     model, start, content = stored.load(known_by, human_and_ball(detail=body))
-    kick = prepare(reference, height, mass=mass, names=names, detail=body)
+    kick = Kick.standard(reference, height, mass=mass, names=names, body=body)
     scene, known = kick.scene, stored.trained_sizes(content)
     model = model.on(scene)
     for difference in (each for body in scene.bodies for each in stored.beyond(body, known[body.kind])):
@@ -188,5 +191,10 @@ def described(found: Checked) -> str:
     return f"human {human} mm over {' / '.join(map(str, WINDOWS))} steps, launch {100.0 * found.launch:.0f} %"
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """The command `larp-adapt`."""
     run(main)
+
+
+if __name__ == "__main__":
+    cli()

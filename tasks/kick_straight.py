@@ -3,8 +3,9 @@
 from functools import partial
 
 from tasks import kick
+from tasks.command import run
 
 TARGET = (4.0, 0.0, 0.5)
 
 if __name__ == "__main__":
-    kick.run(partial(kick.main, target=TARGET))
+    run(partial(kick.main, target=TARGET))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from mpc import CEM, MPPI, Dynamics, GaussNewton, Gradient, Optimizer, Unless
 
@@ -52,7 +52,8 @@ def _found(rounds: int, around: int) -> Stage:
 
 # Points of `tasks.benchmarks.tradeoff`. Over its 16 kicks `balanced` did better with a little sampling in its replans,
 # over 64 others worse.
-PRESETS = {
+PresetName = Literal["fast", "balanced", "accurate"]
+PRESETS: dict[str, Preset] = {
     "fast": Preset(_found(4, 8), (GaussNewton(rounds=1),), every=5),
     "balanced": Preset(_found(12, 16), (GaussNewton(rounds=1),), every=1),
     "accurate": Preset(_found(12, 16), (GaussNewton(rounds=1),), every=5, verify=(8, 3)),

@@ -23,8 +23,8 @@ from larp_model.bodies import human_and_ball, standing_height
 from larp_model.files import write_whole
 from larp_model.scene import Scene
 from larp_model.truth.mujoco import Truth
+from tasks.command import run
 from tasks.data import SHIFT, smooth_noise, stray
-from tasks.kick import run
 from tasks.motions import key_poses
 from tasks.motions.key_poses import KeyPoses
 from tasks.motions.references import starts

@@ -1,4 +1,4 @@
-"""Residuals that the kick and the standing after it share."""
+"""Residuals that tasks share."""
 
 from __future__ import annotations
 
@@ -24,6 +24,12 @@ def pose(states: Array, controls: Array, context: Any, human: slice = slice(None
 def effort(states: Array, controls: Array, context: Any) -> Array:
     """(H, 3 J) how far joint targets (H, J, 3) are from the reference's, `controls` (H, J, 3) [rad] of the context."""
     return (controls - context["controls"]).reshape(len(controls), -1)
+
+
+def apart(states: Array, controls: Array, context: Any, link: int, other: int) -> Array:
+    """(3,) how far two links, by their rows, are apart where they come nearest to each other under control [m]."""
+    found = states[: len(controls), link, packed.POSITION] - states[: len(controls), other, packed.POSITION]
+    return found[jnp.argmin(jnp.sum(found**2, axis=-1))]
 
 
 def upright(states: Array, controls: Array, context: Any) -> Array:

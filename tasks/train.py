@@ -32,8 +32,10 @@ from larp_model.truth import episodes as truth_episodes
 from larp_model.truth.episodes import Episodes
 from larp_model.truth.mujoco import SUBSTEPS, Truth
 from mpc import CEM
+from tasks.command import remember_compilations, run
 from tasks.data import contact_episodes, random_task
-from tasks.kick import WEIGHTS, Kick, Models, learned_models, planners_of, prepare, remember_compilations, run
+from tasks.kick import Kick
+from tasks.models import WEIGHTS, Models, learned_models
 from tasks.presets import Preset
 from tasks.scenarios import Scenario, scenario, trained_at
 
@@ -125,7 +127,7 @@ def planned_episodes(
     seconds: after which no other kick is begun. Returns the episodes, of the plans' horizon, and how many diverged.
     """
     random, begin = np.random.default_rng(seed), time.perf_counter()
-    planners = planners_of(kick, CANDIDATES, models)
+    planners = kick.planners_of(CANDIDATES, models)
     states, controls = [], []
     for index in range(tasks):
         target, shift = random_task(random)
@@ -197,7 +199,7 @@ def main(
     folder = folder or trained_at(chosen.name, design, size)
     remember_compilations()
     design = design or ("compact" if chosen.name == WEIGHTS else "hybrid")
-    kick = prepare() if (chosen.name, design) == (WEIGHTS, "compact") else None
+    kick = Kick.standard() if (chosen.name, design) == (WEIGHTS, "compact") else None
     stages = PAPER if design == "paper" else KICK if kick else stages_of(chosen)
     if design == "hybrid":
         model = designs.hybrid(chosen.scene, designs.SIZES[size or "small"])
@@ -277,5 +279,10 @@ def main(
     console.print(f"weights: {written}")
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """The command `larp-train`."""
     run(main)
+
+
+if __name__ == "__main__":
+    cli()

@@ -14,7 +14,7 @@ from larp_model.bodies import human_and_ball
 from tasks import adapt
 from tasks.adapt import Checked
 from tasks.data import random_episodes
-from tasks.kick import prepare
+from tasks.kick import Kick
 from tasks.scenarios import ANY_HUMAN
 from tasks.train import OVER_MECHANICS
 
@@ -26,7 +26,7 @@ def manifest(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Weights of the least networks, hardly trained."""
     folder = tmp_path_factory.mktemp("weights")
     model = designs.compact(SCENE, designs.LEAST)  # compiles sooner than one over mechanics
-    episodes, _ = random_episodes(SCENE, prepare().reference, 64, 3)
+    episodes, _ = random_episodes(SCENE, Kick.standard().reference, 64, 3)
     windows = training.Windows(SCENE, [(episodes, 1.0)], OVER_MECHANICS)
     weights = training.statistics_of(model, windows, np.random.default_rng(0), batches=1)
     return stored.save(folder, ANY_HUMAN["lean"], model, weights, {})
@@ -75,7 +75,7 @@ def test_adapting_says_that_it_extrapolates_and_writes_the_better_of_both(
 
 def test_training_for_a_time_takes_that_time(manifest: Path, tmp_path: Path) -> None:
     model, weights, _ = stored.load(manifest, SCENE)
-    episodes, _ = random_episodes(SCENE, prepare().reference, 16, 4, steps=12)
+    episodes, _ = random_episodes(SCENE, Kick.standard().reference, 16, 4, steps=12)
     recipe = training.Recipe(100_000, 16, ((1, 1.0),))
     learned, log = training.train(model, recipe, [(episodes, 1.0)], tmp_path, weights, quiet=True, seconds=8.0)
     assert log["seconds"] < 60.0 and training.TIMED < log["history"][-1]["update"] < 100_000

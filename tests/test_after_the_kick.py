@@ -20,7 +20,7 @@ from tasks.standing import HORIZON, SWUNG, Standing
 
 @pytest.fixture(scope="module")
 def task() -> kick.Kick:
-    return kick.prepare()
+    return kick.Kick.standard()
 
 
 def stood(task: kick.Kick, standing: Standing) -> jax.Array:

@@ -14,7 +14,9 @@ from larp_model import weights as stored
 from larp_model.bodies import human_and_ball, standing_height
 from mpc import CEM
 from tasks import kick
+from tasks.command import run
 from tasks.data import random_task
+from tasks.models import WEIGHTS, models_of, shipped
 from tasks.motions import references
 from tasks.presets import PRESETS, Preset, preset_of
 
@@ -40,7 +42,7 @@ PROTOCOL = {
 
 @pytest.fixture(scope="module")
 def task() -> kick.Kick:
-    return kick.prepare()
+    return kick.Kick.standard()
 
 
 @pytest.fixture
@@ -68,17 +70,21 @@ def test_the_standing_height_is_that_of_the_closed_up_rest_pose() -> None:
 
 
 def test_the_weights_of_the_embedded_kick_are_used_for_it_alone() -> None:
-    usual, clip = human_and_ball(), Path("clip.bvh")
-    assert kick.shipped(usual, None).name == "human_ball.json"
-    for scene, reference in ((usual, clip), (human_and_ball(height=1.6), None), (human_and_ball(mass=90.0), clip)):
-        assert kick.shipped(scene, reference).name == "any_human.json"
-    for scene, reference in ((usual, None), (human_and_ball(height=1.6, mass=50.0), None)):
-        stored.load(kick.shipped(scene, reference), scene)
+    usual = human_and_ball()
+    assert shipped(usual, embedded=True).name == "human_ball.json"
+    for scene, embedded in (
+        (usual, False),
+        (human_and_ball(height=1.6), True),
+        (human_and_ball(self_contact=True), True),
+    ):
+        assert shipped(scene, embedded).name == "any_human.json"
+    for scene in (usual, human_and_ball(height=1.6, mass=50.0), human_and_ball(self_contact=True)):
+        stored.load(shipped(scene, embedded=True), scene)
 
 
 def test_the_full_human_has_weights_of_its_own_and_may_touch_the_ball_with_its_toes() -> None:
     scene = human_and_ball(detail="full")
-    assert kick.shipped(scene, None) == kick.shipped(scene, Path("clip.bvh")) == stored.SHIPPED / "full_human.json"
+    assert shipped(scene, embedded=True) == shipped(scene, embedded=False) == stored.SHIPPED / "full_human.json"
     (pair,) = scene.pairs
     assert {"left_toes", "right_toes"} < set(pair.first_links)
 
@@ -100,8 +106,8 @@ def test_tasks_are_drawn_within_the_protocols_bounds() -> None:
 
 
 def test_with_the_shipped_weights_fast_hits_its_targets_and_stays_near_the_reference(task: kick.Kick) -> None:
-    models = kick.models_of(task.scene, "larp", stored.SHIPPED / f"{kick.WEIGHTS}.json")
-    planners, random, reports = kick.planners_of(task, preset_of("fast"), models), np.random.default_rng(5), []
+    models = models_of(task.scene, "larp", stored.SHIPPED / f"{WEIGHTS}.json")
+    planners, random, reports = task.planners_of(preset_of("fast"), models), np.random.default_rng(5), []
     for seed in range(3):
         target, shift = random_task(random)
         reports.append(task.report(task.run(planners, target, seed, task.start(shift), stands=False), target))
@@ -112,8 +118,8 @@ def test_with_the_shipped_weights_fast_hits_its_targets_and_stays_near_the_refer
 
 
 def test_with_the_truth_as_model_what_is_predicted_happens(task: kick.Kick, small: None) -> None:
-    models = kick.models_of(task.scene, "mujoco", stored.SHIPPED, substeps=task.substeps)
-    planners = kick.planners_of(task, preset_of("fast"), models)
+    models = models_of(task.scene, "mujoco", stored.SHIPPED, substeps=task.substeps)
+    planners = task.planners_of(preset_of("fast"), models)
     target = np.array([3.0, 0.2, 0.4])
     execution = task.run(planners._replace(every=100), target, seed=0, stands=False)
     report = task.report(execution, target)
@@ -122,10 +128,10 @@ def test_with_the_truth_as_model_what_is_predicted_happens(task: kick.Kick, smal
 
 
 def test_the_limit_is_the_miss_of_the_same_controls_at_the_finer_step(small: None) -> None:
-    coarse = kick.prepare(substeps=4)
-    models = kick.models_of(coarse.scene, "mujoco", stored.SHIPPED, substeps=4)
+    coarse = kick.Kick.standard(substeps=4)
+    models = models_of(coarse.scene, "mujoco", stored.SHIPPED, substeps=4)
     target = np.array([3.0, 0.2, 0.4])
-    planners = kick.planners_of(coarse, preset_of("fast"), models)
+    planners = coarse.planners_of(preset_of("fast"), models)
     execution = coarse.run(planners, target, seed=0, stands=False)
     report = coarse.report(execution, target)
     assert coarse.replayed(execution, target, substeps=4) == pytest.approx(report["truth_error_m"], abs=1e-6)
@@ -133,20 +139,35 @@ def test_the_limit_is_the_miss_of_the_same_controls_at_the_finer_step(small: Non
     assert abs(report["limit_error_m"] - report["truth_error_m"]) > 0.01
 
 
-def test_a_kick_end_to_end_leaves_all_its_files_and_they_agree(tmp_path: Path, small: None) -> None:
-    kick.main((3.0, 0.3, 0.4), preset="fast", out=tmp_path, seed=3)
+def test_a_kick_end_to_end_leaves_all_its_files_and_they_agree(
+    tmp_path: Path, small: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kick.main((3.0, 0.3, 0.4), preset="fast", out=tmp_path, seed=3, json=True)
     assert {path.name for path in tmp_path.iterdir()} == {"summary.json", "kick.npz", "kick.png", "kick.html"}
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert set(summary) >= PROTOCOL
     assert summary["truth_rollouts"] == 0
+    said = capsys.readouterr()
+    assert json.loads(said.out) == summary, "--json puts the result, and it alone, on stdout"
+    for part in ("setting up", "compiling", "planning", "executing", "writing"):
+        assert part in said.err
     with np.load(tmp_path / "kick.npz", allow_pickle=False) as file:
         path = file["states"][:, -1, :3]
     assert kick.miss(path, np.array(summary["target"])) == pytest.approx(summary["truth_error_m"], abs=1e-3)
 
 
+def test_later_kicks_of_a_preset_compile_nothing_again(small: None) -> None:
+    task = kick.Kick.standard(substeps=4)
+    first, again = (task.to((3.0, side, 0.4), preset="fast", dynamics="mujoco") for side in (0.2, -0.2))
+    assert first.summary["compile_seconds"] > 0.0 == again.summary["compile_seconds"]
+    assert first.states.shape[1:] == (14, 13) and first.joint_targets.shape[1:] == (12, 3)
+    assert again.truth_error_m == again.summary["truth_error_m"] and again.recording.target[1] == -0.2
+    assert "Kick to (3.00, -0.20, 0.40) m" in str(again.table.title)
+
+
 def test_a_target_out_of_reach_is_marked_and_still_gets_a_plan(task: kick.Kick, small: None) -> None:
-    models = kick.models_of(task.scene, "larp", stored.SHIPPED / f"{kick.WEIGHTS}.json")
-    planners = kick.planners_of(task, preset_of("fast"), models)
+    models = models_of(task.scene, "larp", stored.SHIPPED / f"{WEIGHTS}.json")
+    planners = task.planners_of(preset_of("fast"), models)
     target = np.array([0.0, 0.0, 40.0])
     report = task.report(task.run(planners, target, seed=0), target)
     assert not report["reachable"]
@@ -176,7 +197,7 @@ def test_wrong_values_end_with_one_line_that_names_them_and_code_2(
         kick.main(**{"out": tmp_path / "out"} | values)  # type: ignore[arg-type]
 
     with pytest.raises(SystemExit) as ended:
-        kick.run(task, arguments=[])
+        run(task, arguments=[])
     assert ended.value.code == 2
     line = capsys.readouterr().err.strip()
     assert "\n" not in line and argument in line

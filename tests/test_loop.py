@@ -160,7 +160,7 @@ def test_the_plan_carried_on_is_tried_even_where_it_is_a_late_elite() -> None:
     class Asked(Mover):
         def rollout(self, state: jax.Array, controls: jax.Array, steps: jax.Array | None = None) -> jax.Array:
             jax.debug.callback(lambda each: asked.append(np.asarray(each)), controls)
-            return super().rollout(state, controls, steps)
+            return super().rollout(state, controls, steps=steps)
 
     late = CEM(samples=24, rounds=1, elites=12, keep=0.9)
     planner = _planner(Mover(85.0), (late, Verified(Asked(100.0), late, rounds=1, candidates=2)))

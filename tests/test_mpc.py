@@ -330,7 +330,7 @@ def test_an_engine_computes_only_the_steps_that_suffice_and_repeats_the_last(ste
 
     controls = 0.02 * jax.random.normal(jax.random.key(0), (5, HORIZON, 1, 3))
     state = jnp.broadcast_to(jnp.asarray(STATE), (5, 1, 13))
-    states = jax.jit(MujocoDynamics(Counting()).rollout)(state, controls, steps)
+    states = jax.jit(MujocoDynamics(Counting()).rollout)(state, controls, steps=steps)
     whole = PointMass().rollout(state, controls)
     np.testing.assert_allclose(states[:, :steps], whole[:, :steps], atol=1e-6)
     np.testing.assert_array_equal(states[:, steps:], jnp.repeat(states[:, steps - 1 : steps], HORIZON - steps, axis=1))

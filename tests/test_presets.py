@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import pytest
 
 from mpc import CEM, GaussNewton, Optimizer
-from tasks.presets import PRESETS, Preset, Seconds, preset_of, scaled, within
+from tasks.presets import PRESETS, Preset, PresetName, Seconds, preset_of, scaled, within
+
+
+def test_the_command_line_offers_every_preset() -> None:
+    assert get_args(PresetName) == tuple(PRESETS)
 
 
 def candidates(stages: tuple[Optimizer, ...]) -> int:

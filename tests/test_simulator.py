@@ -123,9 +123,8 @@ def test_steps_that_are_not_wanted_repeat_the_last(
     compact_simulator: Simulator, kicks: tuple[np.ndarray, np.ndarray]
 ) -> None:
     states, controls = kicks
-    few = np.asarray(
-        jax.jit(compact_simulator.rollout, compiler_options=SOON)(jnp.asarray(states), jnp.asarray(controls), 3)
-    )
+    rolled = jax.jit(compact_simulator.rollout, compiler_options=SOON)
+    few = np.asarray(rolled(jnp.asarray(states), jnp.asarray(controls), steps=3))
     np.testing.assert_allclose(few[:, :3], roll(compact_simulator, states, controls)[:, :3], atol=1e-9)
     np.testing.assert_array_equal(few[:, 3:], np.repeat(few[:, 2:3], controls.shape[1] - 3, axis=1))
 

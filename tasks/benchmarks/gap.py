@@ -26,8 +26,10 @@ from larp_model.truth.episodes import Episodes
 from mpc import Dynamics, evaluate
 from mpc.search import coloured_noise
 from tasks.benchmarks import report
+from tasks.command import remember_compilations, run
 from tasks.data import random_task
-from tasks.kick import WEIGHTS, Kick, Models, models_of, planners_of, prepare, remember_compilations, run
+from tasks.kick import Kick
+from tasks.models import WEIGHTS, Models, models_of
 from tasks.presets import preset_of
 
 # A candidate is one of the plan's elites, moved by this share of the spread of a first plan.
@@ -43,7 +45,7 @@ def candidates_of(
 
     Returns a row for each plan, and the episodes of all candidates.
     """
-    planners = planners_of(kick, preset_of("balanced"), models)
+    planners = kick.planners_of(preset_of("balanced"), models)
     spread, random = planners.first.scale, np.random.default_rng(seed)
 
     def costs_in(dynamics: Dynamics) -> Callable[..., tuple[jax.Array, jax.Array]]:
@@ -132,7 +134,7 @@ def main(
             raise ValueError(f"{name} is {value}, but must be at least 1")
     report.ready(json, publish)
     remember_compilations()
-    kick = prepare()
+    kick = Kick.standard()
     models, truth = models_of(kick.scene, "larp", weights), models_of(kick.scene, "mujoco", weights)
     rows, episodes = candidates_of(kick, models, truth, targets, candidates, seed)
     model, learned, _ = stored.load(weights, kick.scene)

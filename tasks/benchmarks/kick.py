@@ -14,24 +14,15 @@ from rich.table import Table
 from larp_model.anatomy import Detail
 from larp_model.truth.mujoco import FINE_SUBSTEPS
 from tasks.benchmarks import report
+from tasks.command import remember_compilations, run
 from tasks.data import random_roll, random_task
-from tasks.kick import (
-    HEIGHT,
-    Kick,
-    Models,
-    Planners,
-    kick_of,
-    models_of,
-    planners_of,
-    prepare,
-    remember_compilations,
-    run,
-    shipped,
-)
+from tasks.kick import Kick
+from tasks.models import DynamicsName, Models, models_of
 from tasks.motions.people import random_people
-from tasks.presets import Preset, Seconds, preset_of, within
+from tasks.presets import Preset, PresetName, Seconds, preset_of, within
 from tasks.sensing import noisy
 from tasks.standing import Standing
+from tasks.task import HEIGHT, Planners
 
 WITHIN = (0.1, 0.25, 0.5)
 
@@ -68,7 +59,7 @@ def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 def seconds_of(kick: Kick, models: Models, preset: Preset) -> Seconds:
     """What the preset's plans take, whole windows of them."""
-    planners = planners_of(kick, preset, models)
+    planners = kick.planners_of(preset, models)
     took = []
     for planner, window, links in (
         (planners.first, kick.window(np.array([4.0, 0.0, 0.5])), slice(None)),
@@ -108,8 +99,8 @@ def picture(rows: list[dict[str, Any]], title: str) -> Figure:
 def main(
     targets: int = 16,
     seed: int = 0,
-    preset: str = "balanced",
-    dynamics: str = "larp",
+    preset: PresetName = "balanced",
+    dynamics: DynamicsName = "larp",
     json: Path | None = None,
     weights: Path | None = None,
     reference: Path | None = None,
@@ -168,17 +159,19 @@ def main(
     remember_compilations()
 
     def planned(kick: Kick) -> tuple[Kick, Models, Planners]:
-        models = models_of(kick.scene, dynamics, weights or shipped(kick.scene, reference))  # type: ignore[arg-type]
+        models = models_of(kick.scene, dynamics, weights or kick.weights)
         fitting = chosen if budget is None else within(chosen, budget, partial(seconds_of, kick, models))
-        return kick, models, planners_of(kick, fitting, models)
+        return kick, models, kick.planners_of(fitting, models)
 
-    usual = prepare(reference, height, substeps, detail=body, self_contact=self_contact)
+    usual = Kick.standard(reference, height, body=body, self_contact=self_contact, substeps=substeps)
     people = random_people(np.random.default_rng((seed, 1)), usual.scene, targets)
     always = planned(usual) if bodies == "usual" else None
     random = np.random.default_rng(seed)
 
     def one(index: int, target: np.ndarray, shift: np.ndarray, roll: np.ndarray) -> report.Row:
-        kick, models, planners = always or planned(kick_of(usual.scene.sized(people[index]), reference, substeps))
+        kick, models, planners = always or planned(
+            Kick.of(usual.scene.sized(people[index]), reference, substeps=substeps)
+        )
         sense = noisy(kick.scene, np.random.default_rng((seed, index))) if noise else lambda state: state
         execution = kick.run(planners, target, seed + index, kick.start(shift, roll), sense=sense)
         return kick.report(execution, target) | {

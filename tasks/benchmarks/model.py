@@ -22,7 +22,8 @@ from larp_model.truth import episodes as truth_episodes
 from larp_model.truth.bullet import BulletTruth
 from larp_model.truth.episodes import Episodes
 from tasks.benchmarks import report
-from tasks.kick import WEIGHTS, remember_compilations, run
+from tasks.command import remember_compilations, run
+from tasks.models import WEIGHTS
 from tasks.scenarios import Scenario, around, scenario, trained_at
 
 # A step is timed with so many scenes side by side, over so many steps.

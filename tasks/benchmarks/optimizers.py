@@ -12,7 +12,9 @@ from mpc import CEM, MPPI, GaussNewton, Gradient
 from tasks.benchmarks import report
 from tasks.benchmarks.kick import seconds_of
 from tasks.benchmarks.tradeoff import Point, measure
-from tasks.kick import WEIGHTS, Kick, models_of, prepare, remember_compilations, run
+from tasks.command import remember_compilations, run
+from tasks.kick import Kick
+from tasks.models import WEIGHTS, models_of
 from tasks.presets import Preset, Stage, within
 
 SAMPLING, SOME = CEM(samples=64, rounds=16, elites=12, decay=1.0), CEM(samples=32, rounds=4, elites=8, decay=1.0)
@@ -74,7 +76,7 @@ def main(
         raise ValueError(f"targets is {targets}, but must be at least 1")
     report.ready(json, publish)
     remember_compilations()
-    kick = prepare()
+    kick = Kick.standard()
     command = f"python -m tasks.benchmarks.optimizers --seconds {seconds:g} --targets {targets} --seed {seed}"
     rows = report.collect(
         json, command, {name: partial(compare, kick, name, weights, seconds, targets, seed) for name in WAYS}

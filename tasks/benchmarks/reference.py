@@ -16,7 +16,7 @@ from larp_model import state as packed
 from larp_model.bodies import human_and_ball
 from larp_model.scene import Body, Scene
 from tasks.benchmarks import report
-from tasks.kick import run
+from tasks.command import run
 from tasks.motions import bvh, skeleton
 from tasks.motions.references import Reference, embedded
 

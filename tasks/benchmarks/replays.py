@@ -16,7 +16,8 @@ from larp_model.truth.mujoco import Truth
 from tasks.benchmarks import report
 from tasks.benchmarks.engines import STEPPED, TRACED
 from tasks.gap import LAUNCH_STEPS, contact_step
-from tasks.kick import LINGER, Kick, Planners
+from tasks.kick import Kick
+from tasks.task import LINGER, Planners
 
 # MuJoCo's limit: the engine steps in a step against which all others are judged.
 LIMIT = 160

@@ -16,7 +16,8 @@ from mpc.search import coloured_noise
 from tasks.benchmarks.pushes import Bench, in_double, row
 from tasks.benchmarks.report import Row
 from tasks.data import random_episodes, stray
-from tasks.kick import KNOTS, SEARCH, Kick
+from tasks.kick import Kick
+from tasks.task import KNOTS, SEARCH
 
 # Central differences over the largest of these [m, rad, m/s, rad/s, along a random direction of unit normal numbers];
 # a state whose kink lies within it is tried again with the next.
@@ -140,7 +141,7 @@ class Slope:
 
         def summed(knots: jax.Array, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
             targets = jax.vmap(lambda each: planner.controls(plan._replace(elites=each[None]), controls))(knots)
-            states = model.rollout(jnp.broadcast_to(start, (len(knots), *start.shape)), targets, steps)
+            states = model.rollout(jnp.broadcast_to(start, (len(knots), *start.shape)), targets, steps=steps)
             costs = jax.vmap(lambda s, u: evaluate(kick.terms, s, u, context)[0])(states, targets)
             return jnp.sum(costs), costs
 

@@ -26,8 +26,10 @@ from rich.table import Table
 from larp_model.truth.mujoco import SUBSTEPS as CONVERGED
 from tasks.benchmarks import replays, report
 from tasks.benchmarks.engines import NAMES, PIPELINES, WEIGHTS, Question, case, titled
+from tasks.command import remember_compilations, run
 from tasks.data import random_task
-from tasks.kick import models_of, planners_of, prepare, remember_compilations, run
+from tasks.kick import Kick
+from tasks.models import models_of
 from tasks.presets import preset_of
 
 # Engine steps in a step, by engine; all of Brax's pipelines have the same.
@@ -141,8 +143,8 @@ def price(engine: str, substeps: int, seed: int) -> Question:
 
 def kicks_of(engines: list[replays.Engine], count: int, seed: int) -> dict[str, partial[report.Row]]:
     """The jobs of executed and replayed kicks, by name."""
-    kick = prepare()
-    planners = planners_of(kick, preset_of(PRESET), models_of(kick.scene, "larp", WEIGHTS))
+    kick = Kick.standard()
+    planners = kick.planners_of(preset_of(PRESET), models_of(kick.scene, "larp", WEIGHTS))
     random = np.random.default_rng(seed)
 
     @cache

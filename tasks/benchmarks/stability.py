@@ -24,7 +24,10 @@ from mpc.loop import Phase, Window, execute
 from tasks.benchmarks import pushes, report, slopes
 from tasks.benchmarks.pushes import Bench, refusal, row
 from tasks.benchmarks.report import Row
-from tasks.kick import REACHABLE, WEIGHTS, checked_target, miss, models_of, prepare, remember_compilations, run
+from tasks.command import remember_compilations, run
+from tasks.kick import Kick, miss
+from tasks.models import WEIGHTS, models_of
+from tasks.task import REACHABLE, checked_target
 
 COLOURS = {True: "#0072b2", False: "#d55e00"}
 SMALL = CEM(samples=8, rounds=2, elites=2)
@@ -264,7 +267,7 @@ def main(
         raise ValueError(f"states is {states}, but must be at least 32")
     report.ready(json, publish)
     remember_compilations()
-    kick = prepare()
+    kick = Kick.standard()
     whole = models_of(kick.scene, "larp", weights).whole
     bench = Bench(kick, whole.dynamics)  # type: ignore[attr-defined]
 

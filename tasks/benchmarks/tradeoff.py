@@ -17,9 +17,12 @@ from larp_model import weights as stored
 from larp_model.truth.mujoco import SUBSTEPS
 from mpc import CEM, MPPI, GaussNewton, Gradient, Optimizer, Unless
 from tasks.benchmarks import report
+from tasks.command import remember_compilations, run
 from tasks.data import random_task
-from tasks.kick import BEYOND, FLIGHT, WEIGHTS, Kick, models_of, planners_of, prepare, remember_compilations, run
+from tasks.kick import Kick
+from tasks.models import FLIGHT, WEIGHTS, models_of
 from tasks.presets import PRESETS, Preset
+from tasks.task import BEYOND
 
 # A preset moves where another point is so much better in both error and time.
 BETTER = 0.1
@@ -150,7 +153,7 @@ def _around() -> Iterator[Point]:
 def measure(kick: Kick, point: Point, weights: Path, targets: int, seed: int) -> report.Row:
     """Kicks to the first `targets` random targets of a seed, without the standing that follows them."""
     models = models_of(kick.scene, point.dynamics, weights, substeps=point.substeps)  # type: ignore[arg-type]
-    planners = planners_of(kick, point.preset, models)
+    planners = kick.planners_of(point.preset, models)
     random, kicks = np.random.default_rng(seed), []
     for index in range(targets):
         target, shift = random_task(random)
@@ -267,7 +270,7 @@ def main(
         raise ValueError(f"targets is {targets}, but must be at least 1")
     report.ready(json, publish)
     remember_compilations()
-    kick = prepare()
+    kick = Kick.standard()
     command = f"python -m tasks.benchmarks.tradeoff --targets {targets} --seed {seed}"
     jobs = {point.name: partial(measure, kick, point, weights, targets, seed) for point in points()}
     rows = report.collect(json, command, jobs)

@@ -1,0 +1,26 @@
+"""All benchmarks under one command: `python -m tasks.benchmarks NAME`, or `larp-bench NAME`."""
+
+from collections.abc import Callable
+
+from tasks.benchmarks import gap, kick, model, optimizers, reference, speed, stability, tradeoff
+from tasks.command import run
+
+NAMED: dict[str, Callable[..., None]] = {
+    "kick": kick.main,
+    "model": model.main,
+    "speed": speed.main,
+    "tradeoff": tradeoff.main,
+    "optimizers": optimizers.main,
+    "gap": gap.main,
+    "stability": stability.main,
+    "reference": reference.main,
+}
+
+
+def cli() -> None:
+    """The command `larp-bench`."""
+    run(NAMED)
+
+
+if __name__ == "__main__":
+    cli()

@@ -1,0 +1,441 @@
+"""A task: what a human does to a ball near a reference motion; and what a run of it leaves.
+
+    minimise over theta   sum_g w_g n_g(r_g(S, Q, goal))          what the task wants of the ball: its own terms
+                        + w_r mean_t |x_i(t) - x_i^ref(t)|^2      links stay near the reference, root-aligned
+                        + w_e mean_t |Q(t) - Q^ref(t)|^2          joint targets stay near the reference's
+                        + w_u mean_t max(0, h - z_pelvis(t))^2    the pelvis stays up
+    subject to            S_{t+1} = dynamics(S_t, Q_t),  Q = Q^ref + spline(theta)
+
+The dynamics are LARP or MuJoCo; the plan is executed in MuJoCo. A task of your own says its goals, when it is over, and
+what it reports: see `kick.py`, and `examples/`.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import jax
+import numpy as np
+from rich.table import Table
+
+from larp_model import state as packed
+from larp_model.anatomy import Detail
+from larp_model.bodies import human_and_ball, standing_height
+from larp_model.files import require_writable, write_whole
+from larp_model.scene import Scene
+from larp_model.truth.mujoco import FINE_SUBSTEPS, Truth
+from mpc import CostTerm, Dynamics, Optimizer, Planner, Verified, quadratic
+from mpc.loop import Execution, Phase, Replan, Window, execute
+from tasks import residuals
+from tasks.data import stray
+from tasks.models import FLIGHT, DynamicsName, Models, models_of, shipped
+from tasks.motions import references
+from tasks.motions.bvh import names_in
+from tasks.motions.references import Reference
+from tasks.presets import Preset, PresetName, preset_of, usable
+from tasks.standing import Standing
+from viewer import LivePage, Recording, kick_picture, write_html
+
+# Steps that a plan looks beyond the reference's strike with the whole scene.
+BEYOND = 15
+# Steps for which a plan is carried on once the task is over: for as long as the ball may be pushed.
+LINGER = 6
+# A plan looks at least so many steps ahead, even when the strike is overdue.
+SHORTEST = 15
+# Spread of a first plan, as a share of how far the training data strays from the reference.
+SEARCH = 0.5
+KNOTS = 9
+# Steps for which an execution goes on after the strike, and how often the plan that keeps the human up is made anew.
+AFTER_CONTACT = 200
+STAND_EVERY = 4
+REACHABLE = 0.25
+# Of the human whom the shipped weights know best [m, kg].
+HEIGHT, MASS = 1.75, 70.0
+
+
+class Planners(NamedTuple):
+    """Planners of the first plan, of later ones, every `every` steps, and of the standing that follows."""
+
+    first: Planner
+    again: Planner
+    every: int
+    stand: Planner
+
+
+class Task(ABC):
+    """A scene, a reference and goals; plans, executes and reports. Subclasses say what is abstract here, no more."""
+
+    name: str
+
+    def __init__(
+        self, scene: Scene, reference: Reference, substeps: int = FINE_SUBSTEPS, weights: Path | None = None
+    ) -> None:
+        """scene: its first body is the human, its last the ball. substeps: engine steps of the truth in a step.
+
+        weights: manifest of the learned model's; those of any human by default.
+        """
+        self.scene, self.reference, self.substeps = scene, reference, substeps
+        self.weights = weights or shipped(scene, embedded=False)
+        self.human = scene.rows(scene.bodies[0].name)
+        self.ball = len(scene.links) - 1
+        self.foot = scene.index(scene.bodies[0].name, "right_foot")
+        self.horizon = reference.strike + BEYOND
+        self.standing = standing_height(scene.bodies[0])
+        bounds = np.array([(motor.lower, motor.upper) for motor in scene.motors])
+        self.lower, self.upper = bounds[:, 0], bounds[:, 1]
+        self._planners: dict[tuple[str, str, Path], tuple[Planners, str]] = {}
+
+    @classmethod
+    def standard(
+        cls,
+        reference: str | Path | None = None,
+        height: float = HEIGHT,
+        mass: float | None = None,
+        body: Detail = "lean",
+        self_contact: bool = False,
+        names: str | Path | None = None,
+        substeps: int = FINE_SUBSTEPS,
+    ) -> Self:
+        """The task of a human and a football near the embedded reference, or near a captured one (BVH, or npz).
+
+        height [m] and mass [kg] of the human; as heavy as its height squared by default. body, self_contact: see
+        `bodies.human_and_ball`. names: JSON file of what a BVH file calls our joints; see `bvh.load`. substeps: engine
+        steps of the truth in a step.
+        """
+        heavy = MASS * (height / HEIGHT) ** 2 if mass is None else mass
+        scene = human_and_ball(height=height, mass=heavy, detail=body, self_contact=self_contact)
+        return cls.of(scene, reference, names, substeps)
+
+    @classmethod
+    def of(
+        cls,
+        scene: Scene,
+        reference: str | Path | None = None,
+        names: str | Path | None = None,
+        substeps: int = FINE_SUBSTEPS,
+    ) -> Self:
+        """The task of a scene's human; see `standard`."""
+        if reference is None:
+            if names is not None:
+                raise ValueError(f"names is {str(names)!r}, but there is no reference whose joints they could be")
+            return cls(scene, references.embedded(scene), substeps, shipped(scene, embedded=True))
+        called = None if names is None else names_in(Path(names))
+        return cls(scene, references.captured(Path(reference), scene, names=called), substeps)
+
+    @property
+    @abstractmethod
+    def goals(self) -> tuple[CostTerm, ...]:
+        """The terms that are this task's own.
+
+        Their context holds `goal`, as `asked` gives it, and `times` (H',), when the states are [s from the start]. One
+        of them is called `target`, a distance [m]: by it presets judge whether a plan is good enough.
+        """
+
+    @abstractmethod
+    def asked(self, goal: Any) -> Any:
+        """A goal as a pytree of arrays; refuses what makes no sense."""
+
+    @abstractmethod
+    def place(self, goal: Any) -> np.ndarray:
+        """Where a goal is drawn (3,) [m]."""
+
+    @abstractmethod
+    def over(self, start: np.ndarray, steps: int) -> Callable[[int, np.ndarray], bool]:
+        """Whether, in one of `steps` from a start (L, 13), with a state (L, 13), what is planned for has happened."""
+
+    @abstractmethod
+    def report(self, execution: Execution, goal: Any) -> dict[str, Any]:
+        """What `summary.json` says of a run: `figures`, and at least `truth_error_m` and `model_error_m`."""
+
+    @abstractmethod
+    def title(self, goal: Any) -> str:
+        """Of a run, in a few words."""
+
+    @abstractmethod
+    def facts(self, summary: dict[str, Any]) -> dict[str, str]:
+        """The summary for a person: what is told, and its value with its unit."""
+
+    def start(self) -> np.ndarray:
+        """The state (L, 13) in which the reference begins."""
+        return self.reference.states[0].copy()
+
+    @property
+    def terms(self) -> tuple[CostTerm, ...]:
+        """The named costs of a candidate."""
+        return (
+            *self.goals,
+            CostTerm("reference", partial(residuals.pose, human=self.human), quadratic, 20.0),
+            CostTerm("effort", residuals.effort, quadratic, 0.5),
+            CostTerm("upright", residuals.upright, quadratic, 20.0),
+        )
+
+    def window(self, goal: Any) -> Callable[[int], Window]:
+        """The reference's window from any step on, with the goal, as the residuals' context."""
+
+        def at(step: int) -> Window:
+            states, controls = self.reference.window(step, self.horizon)
+            links = states[:, self.human, packed.POSITION]
+            ahead = np.arange(step + 1, step + 1 + self.horizon)
+            steps = int(np.clip(self.horizon - step, SHORTEST, self.horizon))
+            # What lies beyond the steps that are computed repeats the last, until the ball flies on alone.
+            seen = np.minimum(np.arange(1, self.horizon + 1), steps)
+            times = self.scene.dt * (step + np.concatenate([seen, steps + np.arange(1, FLIGHT + 1)]))
+            context = {
+                "goal": self.asked(goal),
+                "times": times,
+                "reference": links - links[:, :1],
+                "counted": (ahead <= self.reference.strike + 5).astype(float),
+                "height": np.float64(0.85 * self.standing),
+                "controls": controls,
+            }
+            return Window(controls, context, steps)
+
+        return at
+
+    def planner(self, dynamics: Dynamics, optimizers: tuple[Optimizer, ...]) -> Planner:
+        """A planner of this task; what cannot do without gradients is left out where the dynamics have none."""
+        return Planner(
+            dynamics,
+            self.terms,
+            self.horizon,
+            KNOTS,
+            self.scene.dt,
+            SEARCH * stray(self.scene),
+            usable(dynamics, optimizers),
+            self.lower,
+            self.upper,
+        )
+
+    def planners_of(self, preset: Preset, models: Models) -> Planners:
+        """A preset's planners; where MuJoCo is the model there is nothing to try in the truth."""
+        first: tuple[Optimizer, ...] = preset.first
+        again: tuple[Optimizer, ...] = preset.again
+        if any(preset.verify) and models.learned:
+            rows = max(2, preset.candidates)  # the plan carried on is tried beside the first proposal
+            truth = models_of(self.scene, "mujoco", Path(), substeps=self.substeps, rows=rows).whole
+            enough = (("target", preset.enough),)
+            first, again = (
+                (*proposing, Verified(truth, preset.correct, rounds, preset.candidates, enough))
+                if rounds
+                else proposing
+                for proposing, rounds in zip((first, again), preset.verify, strict=True)
+            )
+        planner = self.planner(models.whole, first)
+        return Planners(
+            planner,
+            planner.using(usable(models.whole, again)),
+            preset.every,
+            Standing(self.scene, self.reference).planner(models.human, preset.stand),
+        )
+
+    def planners(
+        self, preset: PresetName = "balanced", dynamics: DynamicsName = "larp", weights: str | Path | None = None
+    ) -> tuple[Planners, str]:
+        """A preset's planners by its name, made once, and the name of their weights."""
+        manifest = self.weights if weights is None else Path(weights)
+        key = (preset, dynamics, manifest)
+        if key not in self._planners:
+            chosen, models = preset_of(preset), models_of(self.scene, dynamics, manifest)
+            self._planners[key] = self.planners_of(chosen, models), models.weights
+        return self._planners[key]
+
+    def to(
+        self,
+        goal: Any,
+        preset: PresetName = "balanced",
+        dynamics: DynamicsName = "larp",
+        weights: str | Path | None = None,
+        seed: int = 0,
+        state: np.ndarray | None = None,
+        observe: Callable[[Execution], None] = lambda execution: None,
+    ) -> Run:
+        """Plan for a goal and execute in MuJoCo.
+
+        goal: of a kick, the target (3,) [m]. weights: manifest of the learned model's; the shipped ones by default.
+        seed: of the planner's random numbers. state: (L, 13) to begin in; see `start`. observe: called after every
+        step. Of later runs with the same preset, dynamics and weights nothing is compiled again.
+        """
+        goal = self.asked(goal)
+        planners, known_by = self.planners(preset, dynamics, weights)
+        execution = self.run(planners, goal, seed, state, observe=observe)
+        said = {"preset": preset, "dynamics": dynamics, "weights": known_by, "seed": seed}
+        return Run(self, execution, goal, self.report(execution, goal) | said)
+
+    def run(
+        self,
+        planners: Planners,
+        goal: Any,
+        seed: int,
+        state: np.ndarray | None = None,
+        steps: int | None = None,
+        observe: Callable[[Execution], None] = lambda execution: None,
+        sense: Callable[[np.ndarray], np.ndarray] = lambda state: state,
+        stands: bool = True,
+    ) -> Execution:
+        """Plan and execute in the truth, from a state of `start`, for `steps` or until 2 s after contact.
+
+        stands: whether plans go on after the task is over, to keep the human up.
+        """
+        state = self.start() if state is None else state
+        steps = self.reference.strike + 20 + AFTER_CONTACT if steps is None else steps
+        first, again, every, stand = planners
+        phases = [Phase(first, again, every, self.window(goal), self.over(state, steps), LINGER)]
+        if stands:
+            standing = Standing(self.scene, self.reference)
+            phases.append(Phase(stand, stand, STAND_EVERY, standing.window, links=self.human))
+        return execute(
+            Truth(self.scene, 1, self.substeps, threads=1),
+            state,
+            phases,
+            steps,
+            key=jax.random.key(seed),
+            dt=self.scene.dt,
+            observe=observe,
+            sense=sense,
+        )
+
+    def touched(self, start: np.ndarray, steps: int) -> Callable[[int, np.ndarray], bool]:
+        """Whether, in a step with a state (L, 13), the ball is no longer as from the start (L, 13) if untouched."""
+        free = self.untouched(start, steps)
+
+        def at(step: int, current: np.ndarray) -> bool:
+            apart = current[self.ball] - free[step]
+            return bool(np.linalg.norm(apart[packed.VELOCITY]) >= 0.5 or abs(apart[packed.POSITION]).max() >= 0.03)
+
+        return at
+
+    def untouched(self, state: np.ndarray, steps: int) -> np.ndarray:
+        """The ball's states (steps + 1, 13) from a state (L, 13) on, if nothing but the ground touched it."""
+        truth = Truth(self.scene.only(self.scene.bodies[-1].name), 1, self.substeps, threads=1)
+        alone = state[None, self.ball :]
+        after, _ = truth.rollout(alone, np.zeros((1, steps, 0, 3)))
+        return np.concatenate([alone[0], after[0][:, 0]])
+
+    @staticmethod
+    def plans(execution: Execution) -> list[Replan]:
+        """The plans of the task itself, without the standing."""
+        return [replan for replan in execution.replans if replan.phase == 0]
+
+    def figures(self, execution: Execution, until: int, end: int) -> dict[str, Any]:
+        """What every report says: how far the body is from the reference until a row, falls until another, times."""
+        states, plans = np.stack(execution.states), self.plans(execution)
+        links = states[: until + 1, self.human, packed.POSITION]
+        wanted = self.reference.states[: until + 1, self.human, packed.POSITION]
+        apart = np.linalg.norm((links - links[:, :1]) - (wanted - wanted[:, :1]), axis=-1)
+        seconds = [replan.info.seconds for replan in plans]
+        again = 1e3 * np.array(seconds[1:] or seconds)
+        return {
+            "reference_deviation_m": float(apart.mean()),
+            "fell": bool((states[:end, 0, 2] < 0.5 * self.standing).any()),
+            "plan_seconds": float(seconds[0]),
+            "replan_ms": {"p50": float(np.quantile(again, 0.5)), "p99": float(np.quantile(again, 0.99))},
+            "compile_seconds": float(sum(replan.info.compile_seconds for replan in execution.replans)),
+            "candidates_lost": sum(r.info.candidates - r.info.finite for r in execution.replans),
+            "truth_rollouts": sum(replan.info.verified for replan in plans),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A task that was planned and executed in the truth.
+
+    summary: as `summary.json` has it; see the README for each entry.
+    """
+
+    task: Task
+    execution: Execution
+    goal: Any
+    summary: dict[str, Any]
+
+    @property
+    def states(self) -> np.ndarray:
+        """What happened: states (T + 1, L, 13)."""
+        return np.stack(self.execution.states)
+
+    @property
+    def joint_targets(self) -> np.ndarray:
+        """What the motors were told (T, J, 3) [rad]."""
+        return np.stack(self.execution.controls)
+
+    @property
+    def predicted(self) -> np.ndarray:
+        """What the last plan expected (T', L, 13), from the state that it saw on."""
+        last = self.task.plans(self.execution)[-1]
+        return np.concatenate([last.state[None], last.info.states])
+
+    @property
+    def truth_error_m(self) -> float:
+        """By how much the target was missed, in the truth [m]."""
+        return float(self.summary["truth_error_m"])
+
+    @property
+    def model_error_m(self) -> float:
+        """By how much the last plan expected to miss it [m]."""
+        return float(self.summary["model_error_m"])
+
+    @property
+    def recording(self) -> Recording:
+        """For the viewer: the truth, the last plan's prediction, the reference."""
+        states, begun = self.states, self.task.plans(self.execution)[-1].step
+        reference = self.task.reference.states[: len(states)]
+        task, goal = self.task, self.goal
+        told = task.title(goal), task.facts(self.summary)
+        return Recording(task.scene, states, task.place(goal), self.predicted, begun, reference, *told)
+
+    @property
+    def table(self) -> Table:
+        """The result for a person."""
+        said, again = self.summary, self.summary["replan_ms"]["p50"]
+        facts = {
+            "missed by, in MuJoCo": f"{100 * self.truth_error_m:.1f} cm",
+            **self.task.facts(said),
+            "first plan, each replan": f"{said['plan_seconds']:.2f} s, {again:.0f} ms",
+        }
+        rows = Table("", "", title=self.task.title(self.goal), show_header=False)
+        for what, value in facts.items():
+            rows.add_row(what, value)
+        return rows
+
+    def save(self, folder: str | Path) -> Path:
+        """Write `NAME.npz`, `.png`, `.html` and, last, `summary.json`, each whole or not at all; returns the folder.
+
+        NAME is the task's; the npz holds states, joint_targets, plan_knots, plan_step and predicted_states.
+        """
+        folder, name, recording = Path(folder), self.task.name, self.recording
+        require_writable(folder, "folder")
+        plans = self.task.plans(self.execution)
+        buffer = io.BytesIO()
+        np.savez_compressed(
+            buffer,
+            states=recording.states.astype(np.float32),
+            joint_targets=self.joint_targets.astype(np.float32),
+            plan_knots=np.asarray(plans[-1].plan.knots),
+            plan_step=plans[-1].step,
+            predicted_states=plans[-1].info.states,
+        )
+        write_whole(folder / f"{name}.npz", buffer.getvalue())
+        costs = {term: [replan.info.terms[term] for replan in plans] for term in plans[-1].info.terms}
+        kick_picture(recording, costs, folder / f"{name}.png")
+        write_html(recording, folder / f"{name}.html")
+        write_whole(folder / "summary.json", (json.dumps(self.summary, indent=2) + "\n").encode())
+        return folder
+
+    def show(self, host: str = "127.0.0.1", port: int = 0) -> LivePage:
+        """Open a page that plays the run, at its `address`, until it is closed; port 0 takes a free one."""
+        page = LivePage(host, port)
+        page.finish(self.recording)
+        return page
+
+
+def checked_target(target: np.ndarray | tuple[float, ...]) -> np.ndarray:
+    """The target (3,) [m]; refuses what is not three finite numbers."""
+    if np.shape(target) != (3,) or not np.isfinite(target).all():
+        raise ValueError(f"target is {target}, but must be three finite numbers, in metres")
+    return np.asarray(target, float)
