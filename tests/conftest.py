@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Iterator
 
 import jax
@@ -30,6 +31,18 @@ def a_cache_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Non
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture(autouse=True, scope="module")
+def nothing_compiled_is_kept() -> Iterator[None]:
+    """Every compiled program keeps pages mapped, and of those a process may have 65 530: after some 1100 tests in one
+    process the next compilation ends it. What a file of tests has compiled goes with it, and so does what it set.
+    """
+    cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    yield
+    jax.config.update("jax_compilation_cache_dir", cache)
+    jax.clear_caches()
+    gc.collect()
 
 
 @pytest.fixture(scope="session")

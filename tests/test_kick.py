@@ -47,8 +47,8 @@ def task() -> kick.Kick:
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    search = (CEM(samples=32, rounds=2, elites=8),)
-    monkeypatch.setitem(PRESETS, "fast", Preset(search, (CEM(samples=16, rounds=1, elites=8),), every=20))
+    search, less = (CEM(samples=32, rounds=2, elites=8),), (CEM(samples=16, rounds=1, elites=8),)
+    monkeypatch.setitem(PRESETS, "fast", Preset(search, less, every=20, stand=less))
 
 
 def test_the_reference_strikes_at_a_kickers_speed_and_is_still_up_half_a_second_later(task: kick.Kick) -> None:
