@@ -7,6 +7,8 @@ from larp_model.parts.part import Model
 from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface
 from larp_model.simulator import Simulator
 
+__version__ = "0.1.0"
+
 __all__ = [
     "DESIGNS",
     "Body",

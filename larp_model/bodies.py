@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from larp_model.anatomy import ANATOMIES, KINDS, Detail, Segment
+from larp_model.names import require_known
 from larp_model.scene import Body, Joint, Link, Pair, Scene, Surface, Vector
 
 # A kicked football stays on the foot for about 10 ms and rebounds to 1.35-1.55 m when dropped from 2 m.
@@ -64,15 +65,13 @@ def human(
     see `Body.sized`, and `motors` multiplies those of single segments' joints.
     """
     _positive(height=height, mass=mass)
-    if detail not in ANATOMIES:
-        raise ValueError(f"detail is {detail!r}, but must be one of {', '.join(ANATOMIES)}")
+    require_known("detail", detail, ANATOMIES)
     usual, size = _usual_human(name, detail), height / 1.75
     segments = [segment_of(link.name) for link in usual.links]
     lengths, radii, motors = dict(lengths or {}), dict(radii or {}), dict(motors or {})
     for argument, factors in (("lengths", lengths), ("radii", radii), ("motors", motors)):
         for segment, factor in factors.items():
-            if segment not in segments:
-                raise ValueError(f"{argument} names {segment!r}, but the segments are {sorted(set(segments))}")
+            require_known(argument, segment, sorted(set(segments)))
             _positive(**{f"{argument}[{segment!r}]": factor})
     sizes = [
         (size * lengths.get(segment, 1.0) * link.length, size * radii.get(segment, 1.0) * link.radius, share)

@@ -18,6 +18,7 @@ from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.kinematics import Kinematics, kinematics, morphology_of
 from larp_model.meeting import Velocities
+from larp_model.names import require_known
 from larp_model.networks import Weights
 from larp_model.parts.part import Hits, Model
 from larp_model.scene import Scene
@@ -76,7 +77,10 @@ class Simulator:
 
         scene: that is to be simulated; what the weights were trained on by default.
         """
-        manifest = stored.SHIPPED / f"{weights}.json" if Path(weights).name == str(weights) else Path(weights)
+        manifest = Path(weights)
+        if manifest.name == str(weights) and not manifest.suffix:
+            require_known("weights", str(weights), sorted(each.stem for each in stored.SHIPPED.glob("*.json")))
+            manifest = stored.SHIPPED / f"{weights}.json"
         return Simulator(*stored.load(manifest, scene)[:2])
 
     @property
@@ -87,7 +91,7 @@ class Simulator:
     def step(self, state: Array, control: Array, torque: Array | None = None, morphology: Array | None = None) -> Array:
         """States (N, L, 13) after one `scene.dt` under controls (N, J, 3) [rad]; see `rollout` for the rest."""
         given = self._checked(state, control, torque, morphology, ())
-        return step(self.model, self.weights, *given)
+        return _step(self.model, self.weights, *given)
 
     def rollout(
         self, state: Array, controls: Array, torques: Array | None = None, morphology: Array | None = None,
@@ -102,7 +106,7 @@ class Simulator:
         or 64 bits. Positions in 32 bits are 0.1 mm apart 1 km from the origin: plan near it.
         """
         given = self._checked(state, controls, torques, morphology, np.shape(controls)[1:2])
-        states = rollout(self.model, self.weights, *given, steps=steps)
+        states = _rollout(self.model, self.weights, *given, steps=steps)
         lost = jnp.cumsum(~packed.healthy(states), axis=1) > 0
         return jnp.where(lost[..., None, None], jnp.nan, states)
 
@@ -155,3 +159,8 @@ def rollout(
     by_time = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), (controls, torques))
     _, states = jax.lax.scan(next_state, state, (jnp.arange(controls.shape[1]), by_time))
     return jnp.moveaxis(states, 0, 1)
+
+
+# Compiled once for each shape, also where nothing around them is; in what JAX traces they leave no mark.
+_step = jax.jit(step, static_argnums=0, inline=True)
+_rollout = jax.jit(rollout, static_argnums=0, inline=True)

@@ -13,12 +13,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
 from safetensors.numpy import load as parse
 from safetensors.numpy import save as serialise
 
 from larp_model import mechanics, meeting
 from larp_model import state as packed
 from larp_model.files import write_whole
+from larp_model.names import require_file
 from larp_model.networks import Size, Statistics, Weights
 from larp_model.parts.articulated import Articulated, Response
 from larp_model.parts.bases import FromNothing, OverMechanics
@@ -107,35 +109,17 @@ def decode(value: Any) -> Any:
 
 def flatten(weights: Weights) -> dict[str, Any]:
     """Weights as named arrays."""
-    arrays: dict[str, Any] = {}
-
-    def visit(prefix: str, node: Any) -> None:
-        if isinstance(node, Mapping):
-            for name, child in node.items():
-                visit(f"{prefix}:{name}", child)
-        elif isinstance(node, Statistics):
-            visit(prefix, node._asdict())
-        else:
-            arrays[prefix.removeprefix(":")] = node
-
-    visit("", weights._asdict())
-    return arrays
+    tree = weights._asdict()
+    for group in ("inputs", "outputs"):
+        tree[group] = {name: each._asdict() for name, each in tree[group].items()}
+    return dict(flatten_dict(tree, sep=":"))
 
 
 def unflatten(arrays: Mapping[str, np.ndarray]) -> Weights:
     """Weights from named arrays."""
-    tree: dict[str, Any] = {}
-    for name, array in arrays.items():
-        *path, leaf = name.split(":")
-        node = tree
-        for part in path:
-            node = node.setdefault(part, {})
-        node[leaf] = jnp.asarray(array)
-    return Weights(
-        tree["networks"],
-        {name: Statistics(**value) for name, value in tree["inputs"].items()},
-        {name: Statistics(**value) for name, value in tree.get("outputs", {}).items()},
-    )
+    tree = unflatten_dict({name: jnp.asarray(array) for name, array in arrays.items()}, sep=":")
+    seen = ({name: Statistics(**each) for name, each in tree.get(group, {}).items()} for group in ("inputs", "outputs"))
+    return Weights(tree["networks"], *seen)
 
 
 def save(
@@ -175,8 +159,7 @@ def load(manifest: Path, scene: Scene | None, partly: bool = False) -> tuple[Mod
     """
     tensors_path = manifest.with_suffix(".safetensors")
     for path in (manifest, tensors_path):
-        if not path.is_file():
-            raise ValueError(f"weights file {path} does not exist")
+        require_file("weights", path)
     try:
         content = dict(json.loads(manifest.read_text()))
         version, expected = content["version"], content["sha256"]

@@ -22,6 +22,7 @@ from larp_model import weights as stored
 from larp_model.anatomy import Detail
 from larp_model.bodies import human_and_ball
 from larp_model.files import require_writable
+from larp_model.names import require_file
 from larp_model.networks import Weights
 from larp_model.parts.part import Model
 from larp_model.simulator import Simulator
@@ -123,8 +124,8 @@ def main(
     begin = time.perf_counter()
     if not (math.isfinite(minutes) and minutes >= LEAST):
         raise ValueError(f"minutes is {minutes:g}, but must be at least {LEAST:g}: nothing is learned in less")
-    if reference is not None and not reference.is_file():
-        raise ValueError(f"reference is {str(reference)!r}, but no such file exists")
+    if reference is not None:
+        require_file("reference", reference)
     require_writable(out, "out")
     remember_compilations()
     console, whole = Console(), 60.0 * minutes

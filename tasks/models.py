@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple, get_args
 
 from larp_model import weights as stored
 from larp_model.bodies import detail_of, human_and_ball
+from larp_model.names import require_known
 from larp_model.networks import Weights
 from larp_model.parts.part import Model
 from larp_model.scene import Scene
@@ -49,8 +50,7 @@ def models_of(scene: Scene, name: DynamicsName, weights: Path, substeps: int = S
     """
     if name == "mujoco":
         return _continued(scene, [MujocoDynamics(Truth(part, rows, substeps)) for part in _parts(scene)], "none")
-    if name not in get_args(DynamicsName):
-        raise ValueError(f"dynamics is {name!r}, but must be 'larp' or 'mujoco'")
+    require_known("dynamics", name, get_args(DynamicsName))
     model, learned, manifest = stored.load(weights, scene)
     found = learned_models(scene, model, learned, manifest["sha256"][:12])
     if weights != stored.SHIPPED / f"{WEIGHTS}.json":

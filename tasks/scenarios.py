@@ -10,6 +10,7 @@ from pathlib import Path
 from larp_model.anatomy import KINDS, Detail
 from larp_model.bodies import chain, detail_of, human_and_ball, human_and_capsule, two_balls, two_chains
 from larp_model.designs import DesignName, SizeName
+from larp_model.names import require_known
 from larp_model.scene import Scene
 from larp_model.truth.episodes import Episodes
 from tasks.data import WINDOWS, random_episodes
@@ -108,6 +109,5 @@ def trained_at(name: str, design: DesignName | None = None, size: SizeName | Non
 
 def scenario(name: str) -> Scenario:
     """The scenario of that name."""
-    if name not in SCENARIOS:
-        raise ValueError(f"scene is {name!r}, but must be one of {', '.join(SCENARIOS)}")
+    require_known("scene", name, SCENARIOS)
     return SCENARIOS[name]

@@ -47,7 +47,7 @@ def test_smaller_errors_are_better_and_the_same_are_not() -> None:
         ({"minutes": math.nan}, "minutes is nan, but must be at least 2"),
         ({"reference": Path("nowhere.bvh")}, "reference is 'nowhere.bvh', but no such file exists"),
         ({"height": -1.0}, "height is -1.0, but must be a positive finite number"),
-        ({"weights": Path("nowhere.json")}, "nowhere.json does not exist"),
+        ({"weights": Path("nowhere.json")}, "weights is 'nowhere.json', but no such file exists"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_drawn(

@@ -172,9 +172,9 @@ def test_damaged_weights_are_refused(stored: Path, scene: Scene, damage: Callabl
 
 def test_missing_files_are_refused(stored: Path, scene: Scene) -> None:
     stored.with_suffix(".safetensors").unlink()
-    assert "tiny.safetensors does not exist" in refusal(stored, scene)
+    assert "tiny.safetensors', but no such file exists" in refusal(stored, scene)
     stored.unlink()
-    assert "tiny.json does not exist" in refusal(stored, scene)
+    assert "tiny.json', but no such file exists" in refusal(stored, scene)
 
 
 def test_a_newer_version_is_refused_as_such(stored: Path, scene: Scene) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from larp_model.bodies import human
+from larp_model.names import require_file
 from larp_model.scene import Body, Vector, anchor
 from tasks.motions.skeleton import LIMBS, SIDES, Motion
 
@@ -30,8 +31,7 @@ class _Joint(NamedTuple):
 def load(path: str | Path) -> Motion:
     """The motion of an npz file with the arguments of `motion` by their names; joints (J,) may be left out."""
     path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"path is {str(path)!r}, but no such file exists")
+    require_file("path", path)
     try:
         with np.load(path, allow_pickle=False) as file:
             given = dict(file)

@@ -19,6 +19,7 @@ from textwrap import shorten
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from larp_model.names import require_file
 from tasks.motions.rest_pose import resting
 from tasks.motions.skeleton import NEEDED, SIDES, Motion, bone, facing, is_t_pose
 
@@ -57,8 +58,7 @@ def load(path: str | Path, names: Mapping[str, str] | None = None) -> Motion:
     one, else what `rest_pose` makes of the frames.
     """
     path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"path is {str(path)!r}, but no such file exists")
+    require_file("path", path)
     tables = list(SKELETONS.values()) if names is None else [_table(names)]
     try:
         joints, duration, data = _parse(path.read_bytes().decode("ascii", "replace").splitlines())
@@ -69,8 +69,7 @@ def load(path: str | Path, names: Mapping[str, str] | None = None) -> Motion:
 
 def names_in(path: Path) -> dict[str, str]:
     """The table of names that a JSON file holds, for `load`."""
-    if not path.is_file():
-        raise ValueError(f"names is {str(path)!r}, but no such file exists")
+    require_file("names", path)
     try:
         found = json.loads(path.read_bytes())
     except ValueError:

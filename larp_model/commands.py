@@ -1,0 +1,48 @@
+"""What the installed commands start. The packages have common names, so that another's may hide one of ours."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+
+HOME = Path(__file__).resolve().parents[1]
+
+
+def kick() -> None:
+    """`larp-kick`: plan a kick and execute it."""
+    _start("tasks.kick")
+
+
+def train() -> None:
+    """`larp-train`: from nothing to weights."""
+    _start("tasks.train")
+
+
+def adapt() -> None:
+    """`larp-adapt`: fit weights to a motion and a body."""
+    _start("tasks.adapt")
+
+
+def bench() -> None:
+    """`larp-bench`: the benchmarks."""
+    _start("tasks.benchmarks.__main__")
+
+
+def hidden() -> str | None:
+    """What is wrong where a package of another project has the name of one of ours; None where all is well."""
+    for name in ("mpc", "viewer", "tasks"):
+        spec = find_spec(name)
+        found = None if spec is None or spec.origin is None else Path(spec.origin).resolve().parent
+        if found != HOME / name:
+            there = "is not installed" if found is None else f"is at {found}, another project's"
+            return f"the package {name!r} {there}, but larp-mpc needs its own, which belongs in {HOME}"
+    return None
+
+
+def _start(module: str) -> None:
+    problem = hidden()
+    if problem:
+        sys.exit(f"error: {problem}")
+    import_module(module).cli()

@@ -1,0 +1,28 @@
+"""Names that people mistype: one line that says what was given, what there is, and what was probably meant."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+from pathlib import Path
+
+
+def require_known(argument: str, name: str, known: Iterable[str]) -> None:
+    """Refuses a name that is none of the known ones."""
+    names = [str(each) for each in known]
+    if name not in names:
+        raise ValueError(f"{argument} is {name!r}, but must be one of {', '.join(names)}{meant(name, names)}")
+
+
+def require_file(argument: str, path: str | Path) -> None:
+    """Refuses a path at which there is no file."""
+    path = Path(path)
+    if not path.is_file():
+        beside = [each.name for each in path.parent.iterdir()] if path.parent.is_dir() else []
+        raise ValueError(f"{argument} is {str(path)!r}, but no such file exists{meant(path.name, beside)}")
+
+
+def meant(name: str, names: Iterable[str]) -> str:
+    """The nearest of the names as a question; nothing where none is near."""
+    near = get_close_matches(str(name), list(names), n=1)
+    return f"; did you mean {near[0]!r}?" if near else ""
