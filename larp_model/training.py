@@ -18,6 +18,7 @@ import optax
 import orbax.checkpoint as ocp
 from jax import Array
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from tensorboardX import SummaryWriter
 
 from larp_model import losses, meeting, rotation
 from larp_model.losses import LossWeights
@@ -202,9 +203,9 @@ def train(
 ) -> tuple[Weights, dict[str, Any]]:
     """Train on sources of (trajectories, share); returns the weights and a log of loss, norms and drops.
 
-    folder: where checkpoints are kept; a run cut off there goes on from its last. start: weights to go on from; what
-    they lack begins fresh. seconds: only as many of the updates as fit into them, judged by the first. Where a hundred
-    batches in a row are dropped, the last good weights are returned and the log says so.
+    folder: where checkpoints are kept, and logs for TensorBoard; a run cut off there goes on from its last. start:
+    weights to go on from; what they lack begins fresh. seconds: only as many of the updates as fit into them, judged by
+    the first. Where a hundred batches in a row are dropped, the last good weights are returned and the log says so.
     """
     random = np.random.default_rng(recipe.seed)
     scene, windows = model.scene, Windows(model.scene, sources, recipe)
@@ -259,7 +260,7 @@ def train(
         TextColumn("training"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"),
         TextColumn("{task.fields[note]}"), TimeRemainingColumn(),
     )  # fmt: skip
-    with Progress(*columns, disable=quiet) as bar:
+    with Progress(*columns, disable=quiet) as bar, SummaryWriter(str(folder / "tensorboard")) as board:
         task = bar.add_task("", total=recipe.updates, completed=first, note="")
         index = first
         while index < recipe.updates:
@@ -282,6 +283,8 @@ def train(
                 bar.update(task, completed=index + 1, note=note)
                 with (folder / "history.jsonl").open("a") as file:
                     file.write(json.dumps(log["history"][-1]) + "\n")
+                for name, value in log["history"][-1].items():
+                    board.add_scalar(name, value, index + 1)
                 recent = []
                 if now - saved > 60 or index + 1 == recipe.updates:
                     content = (Progressed(networks, state, index + 1), weights[1:])

@@ -15,10 +15,11 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import numpy as np
+import tyro
 from rich.console import Console
 
 from larp_model import designs, evaluation, training
@@ -33,6 +34,7 @@ from larp_model.truth.episodes import Episodes
 from larp_model.truth.mujoco import SUBSTEPS, Truth
 from mpc import CEM
 from tasks.command import remember_compilations, run
+from tasks.curve import curve_picture
 from tasks.data import contact_episodes, random_task
 from tasks.kick import Kick
 from tasks.models import WEIGHTS, Models, learned_models
@@ -178,7 +180,7 @@ def main(
     tasks: int = 30,
     effort: float = 1.0,
     seed: int = 100,
-    start: Path | None = None,
+    start: Annotated[Path | None, tyro.conf.arg(name="from")] = None,
 ) -> None:
     """Train the learned simulator of a scene.
 
@@ -251,6 +253,7 @@ def main(
         updates = max(1, round(effort * stage.recipe.updates))
         recipe = replace(stage.recipe, updates=updates, seed=seed + number)
         learned, log = training.train(model, recipe, used, folder / stage.name, learned)
+        curve_picture([folder / each.name for each in stages[: number + 1]], folder / "training.png")
         rounds = [
             *rounds,
             {

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
 from larp_model import designs, training
 from larp_model.bodies import chain, two_balls
@@ -22,6 +23,7 @@ from larp_model.scene import Scene
 from larp_model.training import Batch, Recipe, Windows, first_contacts, statistics_of, train
 from larp_model.truth.episodes import Episodes, record
 from larp_model.truth.mujoco import Truth
+from tasks.curve import curve_picture
 
 SWING = Scene((chain(links=2),))
 MODEL = designs.compact(SWING, designs.LEAST)
@@ -95,6 +97,10 @@ def test_a_short_training_lowers_the_loss(compact: Model, episodes: Episodes, tm
     assert len(losses) == 2 and losses[-1] < 0.8 * losses[0]
     assert not log["stopped_early"] and log["history"][-1]["update"] == 200
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(weights))
+    (logged,) = (tmp_path / "tensorboard").iterdir()
+    assert b"loss" in logged.read_bytes()
+    curve_picture([tmp_path, tmp_path / "not begun"], tmp_path / "training.png")
+    assert imread(tmp_path / "training.png").std() > 0.01
 
 
 def test_a_training_cut_off_goes_on_as_if_it_had_not_been(
