@@ -21,6 +21,7 @@ from jax import Array
 from larp_model import state as packed
 from larp_model.anatomy import Detail
 from larp_model.files import require_writable
+from larp_model.names import require_file
 from larp_model.truth.mujoco import FINE_SUBSTEPS, Truth
 from mpc import CostTerm, l2, nearest_on_path, quadratic
 from mpc.loop import Execution
@@ -28,9 +29,9 @@ from tasks import residuals
 from tasks.command import Teller, remember_compilations, run
 from tasks.gap import contact_step, gap, told
 from tasks.models import DynamicsName
-from tasks.presets import PresetName
+from tasks.presets import PresetName, changed, preset_of
 from tasks.task import AFTER_CONTACT, HEIGHT, REACHABLE, Task, checked_target
-from viewer import LivePage, nearest_approach
+from viewer import LivePage, check_film, nearest_approach, write_film
 
 Pair = np.ndarray | tuple[float, float]
 
@@ -141,6 +142,7 @@ def miss(path: np.ndarray, target: np.ndarray) -> float:
 def main(
     target: tuple[float, float, float] = (4.0, 0.0, 0.5),
     preset: PresetName = "balanced",
+    change: tuple[str, ...] = (),
     dynamics: DynamicsName = "larp",
     reference: Path | None = None,
     names: Path | None = None,
@@ -153,6 +155,7 @@ def main(
     out: Path = Path("runs/kick"),
     view: bool = False,
     port: int = 8080,
+    video: Path | None = None,
     quiet: bool = False,
     json: bool = False,
 ) -> None:
@@ -161,6 +164,7 @@ def main(
     Args:
         target: where the ball's centre should pass [m]: forwards, to the left, up.
         preset: how much a plan may cost.
+        change: fields of the preset to change: every=2 again.0.rounds=3 "verify=(4, 2)".
         dynamics: the planner's model: larp (learned) or mujoco.
         reference: a captured kick (BVH, or npz of joint angles) instead of the embedded one.
         names: JSON object of what the BVH file calls our joints: {"Hips": "pelvis", ...}; known skeletons need none.
@@ -173,18 +177,23 @@ def main(
         out: folder for summary.json, kick.npz, kick.png and kick.html.
         view: show the kick live in the browser, on 127.0.0.1.
         port: of the page.
+        video: a film of the kick to write: FILE.mp4 or FILE.gif.
         quiet: print nothing.
         json: print the summary as JSON, and on stderr what else is told.
     """
     goal = checked_target(target)
-    if reference is not None and not reference.is_file():
-        raise ValueError(f"reference is {str(reference)!r}, but no such file exists")
+    if reference is not None:
+        require_file("reference", reference)
+    chosen = changed(preset_of(preset), change)
     require_writable(out, "out")
+    if video is not None:
+        check_film(video)
+        require_writable(video.parent, "video")
     remember_compilations()
     tell = Teller(quiet, json)
     with tell.part("setting up"):
         kick = Kick.standard(reference, height, mass, body, self_contact, names)
-        kick.planners(preset, dynamics, weights)
+        kick.planners(chosen, dynamics, weights)
     page = LivePage(port=port) if view else None
     if page:
         tell(f"watch it at {page.address} (Ctrl-C ends)")
@@ -198,13 +207,17 @@ def main(
 
     begin = time.perf_counter()
     tell("planning and executing; what is new is compiled first")
-    kicked = kick.to(goal, preset, dynamics, weights, seed, observe=observe)
+    kicked = kick.to(goal, chosen, dynamics, weights, seed, observe=observe)
+    kicked.summary["preset"] = " ".join((preset, *change))
     replans = [replan.info for replan in kicked.execution.replans]
     compiling, planning = (sum(getattr(info, field) for info in replans) for field in ("compile_seconds", "seconds"))
     executing = time.perf_counter() - begin - compiling - planning
     tell(f"compiling {compiling:.1f} s, planning {planning:.1f} s, executing {executing:.1f} s")
     with tell.part("writing"):
         kicked.save(out)
+    if video is not None:
+        with tell.part(f"filming {video}"):
+            write_film(kicked.recording, video)
     tell.result(kicked.table, kicked.summary)
     tell(f"{out}/: summary.json, kick.npz, kick.png, kick.html")
     if page:

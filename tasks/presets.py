@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, Literal, NamedTuple
 
+from larp_model.names import require_known
 from mpc import CEM, MPPI, Dynamics, GaussNewton, Gradient, Optimizer, Unless
 
 # Time of a replan, as a share of the first plan's, where a budget is given.
@@ -67,9 +69,35 @@ def usable(dynamics: Dynamics, optimizers: Stage) -> Stage:
 
 def preset_of(name: str) -> Preset:
     """The preset of this name."""
-    if name not in PRESETS:
-        raise ValueError(f"preset is {name!r}, but must be one of {', '.join(PRESETS)}")
+    require_known("preset", name, PRESETS)
     return PRESETS[name]
+
+
+def changed(preset: Preset, changes: Sequence[str]) -> Preset:
+    """The preset with other fields, each given as NAME=VALUE: "every=2", "again.0.rounds=3", "verify=(4, 2)"."""
+    for change in changes:
+        path, _, value = change.partition("=")
+        try:
+            given = ast.literal_eval(value)
+        except (ValueError, SyntaxError):
+            raise ValueError(f"change is {change!r}, but must be NAME=VALUE, its value a number or (a, b)") from None
+        preset = _changed(preset, path.split("."), given, change)
+    return preset
+
+
+def _changed(part: Any, path: Sequence[str], value: Any, change: str) -> Any:
+    if not path:
+        kinds = (int, float) if isinstance(part, float) else (type(part),)
+        if type(value) not in kinds or not isinstance(part, int | float | tuple | bool):
+            raise ValueError(f"change is {change!r}, but what it changes is {part!r}")
+        return value
+    name, *rest = path
+    if isinstance(part, tuple):
+        require_known(f"change is {change!r}: {name}", name, map(str, range(len(part))))
+        return (*part[: int(name)], _changed(part[int(name)], rest, value, change), *part[int(name) + 1 :])
+    known = [field.name for field in fields(part)] if is_dataclass(part) else []
+    require_known(f"change is {change!r}: {name}", name, known)
+    return replace(part, **{name: _changed(getattr(part, name), rest, value, change)})
 
 
 class Seconds(NamedTuple):

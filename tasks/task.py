@@ -32,16 +32,17 @@ from larp_model.files import require_writable, write_whole
 from larp_model.scene import Scene
 from larp_model.truth.mujoco import FINE_SUBSTEPS, Truth
 from mpc import CostTerm, Dynamics, Optimizer, Planner, Verified, quadratic
-from mpc.loop import Execution, Phase, Replan, Window, execute
+from mpc.loop import Execution, Phase, Replan, Window, World, execute
 from tasks import residuals
 from tasks.data import stray
 from tasks.models import FLIGHT, DynamicsName, Models, models_of, shipped
 from tasks.motions import references
 from tasks.motions.bvh import names_in
 from tasks.motions.references import Reference
+from tasks.motions.skeleton import Motion
 from tasks.presets import Preset, PresetName, preset_of, usable
 from tasks.standing import Standing
-from viewer import LivePage, Recording, kick_picture, write_html
+from viewer import LivePage, Recording, framed, kick_picture, write_html
 
 # Steps that a plan looks beyond the reference's strike with the whole scene.
 BEYOND = 15
@@ -90,12 +91,12 @@ class Task(ABC):
         self.standing = standing_height(scene.bodies[0])
         bounds = np.array([(motor.lower, motor.upper) for motor in scene.motors])
         self.lower, self.upper = bounds[:, 0], bounds[:, 1]
-        self._planners: dict[tuple[str, str, Path], tuple[Planners, str]] = {}
+        self._planners: dict[tuple[str | Preset, str | int, Path], tuple[Planners, str]] = {}
 
     @classmethod
     def standard(
         cls,
-        reference: str | Path | None = None,
+        reference: str | Path | Motion | Reference | None = None,
         height: float = HEIGHT,
         mass: float | None = None,
         body: Detail = "lean",
@@ -103,8 +104,9 @@ class Task(ABC):
         names: str | Path | None = None,
         substeps: int = FINE_SUBSTEPS,
     ) -> Self:
-        """The task of a human and a football near the embedded reference, or near a captured one (BVH, or npz).
+        """The task of a human and a football near the embedded reference, or near one of your own.
 
+        reference: a captured kick (BVH, or npz), a motion in memory (`angles.motion`), or what performs it already.
         height [m] and mass [kg] of the human; as heavy as its height squared by default. body, self_contact: see
         `bodies.human_and_ball`. names: JSON file of what a BVH file calls our joints; see `bvh.load`. substeps: engine
         steps of the truth in a step.
@@ -117,17 +119,19 @@ class Task(ABC):
     def of(
         cls,
         scene: Scene,
-        reference: str | Path | None = None,
+        reference: str | Path | Motion | Reference | None = None,
         names: str | Path | None = None,
         substeps: int = FINE_SUBSTEPS,
     ) -> Self:
         """The task of a scene's human; see `standard`."""
+        if names is not None and not isinstance(reference, str | Path):
+            raise ValueError(f"names is {str(names)!r}, but there is no file whose joints they could be")
         if reference is None:
-            if names is not None:
-                raise ValueError(f"names is {str(names)!r}, but there is no reference whose joints they could be")
             return cls(scene, references.embedded(scene), substeps, shipped(scene, embedded=True))
+        if isinstance(reference, Reference):
+            return cls(scene, reference, substeps)
         called = None if names is None else names_in(Path(names))
-        return cls(scene, references.captured(Path(reference), scene, names=called), substeps)
+        return cls(scene, references.captured(reference, scene, names=called), substeps)
 
     @property
     @abstractmethod
@@ -236,36 +240,47 @@ class Task(ABC):
         )
 
     def planners(
-        self, preset: PresetName = "balanced", dynamics: DynamicsName = "larp", weights: str | Path | None = None
+        self,
+        preset: PresetName | Preset = "balanced",
+        dynamics: DynamicsName | Dynamics = "larp",
+        weights: str | Path | None = None,
     ) -> tuple[Planners, str]:
-        """A preset's planners by its name, made once, and the name of their weights."""
+        """A preset's planners, made once, and the name of their weights; see `to`."""
         manifest = self.weights if weights is None else Path(weights)
-        key = (preset, dynamics, manifest)
+        key = (preset, dynamics if isinstance(dynamics, str) else id(dynamics), manifest)
         if key not in self._planners:
-            chosen, models = preset_of(preset), models_of(self.scene, dynamics, manifest)
+            chosen = preset_of(preset) if isinstance(preset, str) else preset
+            if isinstance(dynamics, str):
+                models = models_of(self.scene, dynamics, manifest)
+            else:
+                models = models_of(self.scene, "larp", manifest)._replace(whole=dynamics, weights="none")
             self._planners[key] = self.planners_of(chosen, models), models.weights
         return self._planners[key]
 
     def to(
         self,
         goal: Any,
-        preset: PresetName = "balanced",
-        dynamics: DynamicsName = "larp",
+        preset: PresetName | Preset = "balanced",
+        dynamics: DynamicsName | Dynamics = "larp",
         weights: str | Path | None = None,
         seed: int = 0,
         state: np.ndarray | None = None,
         observe: Callable[[Execution], None] = lambda execution: None,
+        world: World | None = None,
     ) -> Run:
-        """Plan for a goal and execute in MuJoCo.
+        """Plan for a goal and execute in MuJoCo, or in a world of your own.
 
-        goal: of a kick, the target (3,) [m]. weights: manifest of the learned model's; the shipped ones by default.
-        seed: of the planner's random numbers. state: (L, 13) to begin in; see `start`. observe: called after every
-        step. Of later runs with the same preset, dynamics and weights nothing is compiled again.
+        goal: of a kick, the target (3,) [m]. preset: its name, or one of your own. dynamics: the planner's model, by
+        name or your own of the whole scene; what keeps the human up afterwards has the learned one. weights: manifest
+        of the learned model's; the shipped ones by default. seed: of the planner's random numbers. state: (L, 13) to
+        begin in; see `start`. observe: called after every step. Of later runs with the same preset, dynamics and
+        weights nothing is compiled again.
         """
         goal = self.asked(goal)
         planners, known_by = self.planners(preset, dynamics, weights)
-        execution = self.run(planners, goal, seed, state, observe=observe)
-        said = {"preset": preset, "dynamics": dynamics, "weights": known_by, "seed": seed}
+        execution = self.run(planners, goal, seed, state, observe=observe, world=world)
+        named = (each if isinstance(each, str) else type(each).__name__ for each in (preset, dynamics))
+        said = dict(zip(("preset", "dynamics"), named, strict=True)) | {"weights": known_by, "seed": seed}
         return Run(self, execution, goal, self.report(execution, goal) | said)
 
     def run(
@@ -278,10 +293,11 @@ class Task(ABC):
         observe: Callable[[Execution], None] = lambda execution: None,
         sense: Callable[[np.ndarray], np.ndarray] = lambda state: state,
         stands: bool = True,
+        world: World | None = None,
     ) -> Execution:
         """Plan and execute in the truth, from a state of `start`, for `steps` or until 2 s after contact.
 
-        stands: whether plans go on after the task is over, to keep the human up.
+        stands: whether plans go on after the task is over, to keep the human up. world: to execute in instead.
         """
         state = self.start() if state is None else state
         steps = self.reference.strike + 20 + AFTER_CONTACT if steps is None else steps
@@ -291,7 +307,7 @@ class Task(ABC):
             standing = Standing(self.scene, self.reference)
             phases.append(Phase(stand, stand, STAND_EVERY, standing.window, links=self.human))
         return execute(
-            Truth(self.scene, 1, self.substeps, threads=1),
+            world or Truth(self.scene, 1, self.substeps, threads=1),
             state,
             phases,
             steps,
@@ -426,6 +442,10 @@ class Run:
         write_html(recording, folder / f"{name}.html")
         write_whole(folder / "summary.json", (json.dumps(self.summary, indent=2) + "\n").encode())
         return folder
+
+    def _repr_html_(self) -> str:
+        """The replay, where a notebook shows the run."""
+        return framed(self.recording)
 
     def show(self, host: str = "127.0.0.1", port: int = 0) -> LivePage:
         """Open a page that plays the run, at its `address`, until it is closed; port 0 takes a free one."""

@@ -14,6 +14,7 @@ ROOT = Path(__file__).parents[1]
 # A package's own name is its __init__.py, which re-exports what stands above.
 ORDER = [
     "larp_model.files",
+    "larp_model.names",
     "larp_model.scene",
     "larp_model.anatomy",
     "larp_model.bodies",
@@ -46,6 +47,7 @@ ORDER = [
     "larp_model.truth.episodes",
     "larp_model.truth",
     "larp_model",
+    "larp_model.commands",
     "mpc.dynamics",
     "mpc.spline",
     "mpc.cost",
@@ -67,6 +69,7 @@ ORDER = [
     "viewer.app",
     "viewer.replay",
     "viewer.picture",
+    "viewer.film",
     "viewer",
     "tasks.motions.details",
     "tasks.motions.key_poses",
@@ -89,6 +92,7 @@ ORDER = [
     "tasks.sensing",
     "tasks.gap",
     "tasks.command",
+    "tasks.curve",
     "tasks.models",
     "tasks.task",
     "tasks.kick",

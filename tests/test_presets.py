@@ -7,7 +7,7 @@ from typing import get_args
 import pytest
 
 from mpc import CEM, GaussNewton, Optimizer
-from tasks.presets import PRESETS, Preset, PresetName, Seconds, preset_of, scaled, within
+from tasks.presets import PRESETS, Preset, PresetName, Seconds, changed, preset_of, scaled, within
 
 
 def test_the_command_line_offers_every_preset() -> None:
@@ -57,3 +57,27 @@ def test_a_budget_below_what_the_preset_can_do_says_what_the_least_is() -> None:
 def test_an_unknown_preset_lists_the_known_ones() -> None:
     with pytest.raises(ValueError, match="fast, balanced, accurate"):
         preset_of("quick")
+
+
+def test_any_field_of_a_preset_can_be_changed_by_its_name() -> None:
+    found = changed(PRESETS["fast"], ["every=2", "again.0.rounds=3", "verify=(4, 2)", "enough=1"])
+    assert (found.every, found.verify, found.enough) == (2, (4, 2), 1)
+    assert found.again == (GaussNewton(rounds=3),) and found.first == PRESETS["fast"].first
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ("every", "must be NAME=VALUE"),
+        ("every=often", "must be NAME=VALUE"),
+        ("every=2.5", "what it changes is 5"),
+        ("evry=2", "did you mean 'every'"),
+        ("again.1.rounds=3", "must be one of 0"),
+        ("again.0=3", "what it changes is GaussNewton"),
+        ("again.0.round=3", "did you mean 'rounds'"),
+        ("every.more=2", "'more'"),
+    ],
+)
+def test_a_change_that_makes_no_sense_is_refused_by_name(change: str, complaint: str) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        changed(PRESETS["fast"], [change])

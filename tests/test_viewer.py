@@ -20,7 +20,8 @@ from matplotlib.image import imread
 from larp_model.bodies import human_and_ball
 from larp_model.scene import Vector
 from larp_model.state import ORIENTATION, POSITION, VELOCITY
-from viewer import LivePage, Recording, kick_picture, nearest_approach, write_html
+from viewer import LivePage, Recording, check_film, kick_picture, nearest_approach, write_film, write_html
+from viewer.film import Camera, frames
 from viewer.panel import Panel, within
 from viewer.scene_view import Mesh, capsule_mesh, football_meshes
 
@@ -233,3 +234,34 @@ def test_replay_runs_in_a_browser(recording: Recording, tmp_path: Path) -> None:
     subprocess.run(command, check=True, capture_output=True, timeout=120)
     pixels = imread(tmp_path / "page.png")[..., :3]
     assert (np.ptp(pixels, axis=-1) > 0.3).mean() > 0.001, "nothing coloured is on the page"
+
+
+def test_the_film_goes_slowly_up_to_the_target_and_shows_what_moves(recording: Recording) -> None:
+    pictures = list(frames(recording, (320, 180), rate=10.0))
+    passed = nearest_approach(recording.path, recording.target).row * SCENE.dt + 0.1
+    assert len(pictures) == pytest.approx(10.0 * (4.0 * passed + recording.duration - passed), abs=2)
+    assert pictures[0].shape == (180, 320, 3) and (pictures[0] != pictures[-1]).any()
+    assert np.unique(pictures[0].reshape(-1, 3), axis=0).shape[0] > 50, "it is not blank"
+
+
+def test_the_camera_is_as_near_as_it_can_be_with_all_points_in_its_picture() -> None:
+    points = np.random.default_rng(0).uniform(-1.0, 2.0, (50, 3))
+    found = abs(Camera.of(points, 0.5)(points)) / (1.0, 0.5)
+    assert found.max() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".mp4"])
+def test_a_film_is_written_in_the_format_of_its_name(suffix: str, recording: Recording, tmp_path: Path) -> None:
+    if suffix == ".mp4":
+        pytest.importorskip("imageio_ffmpeg")
+    path = tmp_path / f"kick{suffix}"
+    write_film(recording, path, (160, 90), rate=10.0)
+    begin = path.read_bytes()[:12]
+    assert begin[:6] == b"GIF89a" if suffix == ".gif" else begin[4:8] == b"ftyp"
+    assert path.stat().st_size > 10_000
+    assert [each.name for each in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_film_of_no_known_format_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"video is 'kick.avi', but its name must end in .mp4 or .gif"):
+        check_film("kick.avi")

@@ -18,6 +18,16 @@ font:14px/1.5 system-ui,sans-serif;color:#222;background:#fffc;pointer-events:no
 
 def write_html(recording: Recording, path: str | Path) -> None:
     """Write the page: truth, prediction as a ghost, both paths, target, and the summary in a corner."""
+    write_whole(path, page_of(recording).encode())
+
+
+def framed(recording: Recording, height: int = 480) -> str:
+    """The page as a part of another, of a notebook for instance."""
+    return f'<iframe srcdoc="{escape(page_of(recording))}" width="100%" height="{height}" frameborder="0"></iframe>'
+
+
+def page_of(recording: Recording) -> str:
+    """The page's HTML."""
     server = open_server(port=0)
     try:
         stage = Stage(server, recording.scene, recording.target, recording.traced)
@@ -37,4 +47,4 @@ def write_html(recording: Recording, path: str | Path) -> None:
     head, _, rest = page.partition("<title>")
     page = f"{head}<title>{title}{rest[rest.index('</title>') :]}"
     body = page.rindex("</body>")
-    write_whole(path, (page[:body] + _CAPTION.format(caption) + page[body:]).encode())
+    return page[:body] + _CAPTION.format(caption) + page[body:]

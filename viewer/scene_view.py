@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -48,6 +49,7 @@ def capsule_mesh(length: float, radius: float, axis: Vector = (0.0, 0.0, 1.0), s
     return weld(np.stack([np.stack([a, b, c], axis=-2), np.stack([a, c, d], axis=-2)]).reshape(-1, 3, 3))
 
 
+@cache
 def football_meshes(radius: float, subdivisions: int = 3) -> tuple[Mesh, Mesh]:
     """The 20 hexagons and the 12 pentagons of a football, a truncated icosahedron blown up. radius [m]."""
     golden = 0.5 * (1.0 + 5.0**0.5)

@@ -1,0 +1,283 @@
+"""A kick as a film, mp4 or gif: human, ball and both paths in perspective, slowly up to the target, then as it was."""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import imageio.v3 as imageio
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from larp_model.files import write_whole
+from larp_model.state import ORIENTATION, POSITION
+from viewer.recording import Approach, Recording, nearest_approach
+from viewer.scene_view import BALL_PATCHES, PREDICTION, TARGET, TRUTH, Colour, football_meshes, link_colour
+
+SUFFIXES = (".mp4", ".gif")
+SLOW = 0.25  # of its speed, up to the target
+LINGER = 0.1  # s for which it stays slow beyond
+DOTS = 100  # per inch
+# The camera looks from the right-hand side, a little from behind and above.
+AZIMUTH, ELEVATION = np.radians(65.0), np.radians(12.0)
+TANGENT = 0.32  # of half the angle of view, across
+MARGIN = 0.4  # m around what must be seen
+NEAR, FAR = 0.5, 20.0  # m, between which the ground is drawn
+LIGHT = np.array([0.25, -0.45, -1.0])  # the way it falls
+SKY, GROUND, LINES, SHADOW, INK, QUIET = "#ffffff", "#f3f5f7", "#d5dae0", "#dde1e6", "#22262c", "#5b6470"
+CIRCLE = np.stack([np.cos(np.linspace(0, 2 * np.pi, 40)), np.sin(np.linspace(0, 2 * np.pi, 40))], axis=-1)
+
+
+def check_film(path: str | Path) -> None:
+    """Refuses, at once, a path that no film can be written to."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ValueError(f"video is {str(path)!r}, but its name must end in {' or '.join(SUFFIXES)}")
+    if suffix == ".mp4":
+        try:
+            import imageio_ffmpeg  # noqa: F401
+        except ImportError:
+            raise ValueError("video: mp4 needs an encoder: pip install 'larp-mpc[video]', or ask for a .gif") from None
+
+
+def write_film(recording: Recording, path: str | Path, size: tuple[int, int] = (1280, 720), rate: float = 30.0) -> None:
+    """Write a film of (width, height) pixels and so many pictures a second; see `check_film`."""
+    check_film(path)
+    pictures = frames(recording, size, rate)
+    if Path(path).suffix.lower() == ".gif":
+        # Only delays of whole hundredths of a second are kept by all players.
+        delay, stacked = 10 * round(100.0 / rate), np.stack(list(pictures))
+        write_whole(path, imageio.imwrite("<bytes>", stacked, extension=".gif", duration=delay, loop=0))
+        return
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    # Started here, since the encoder's own start forks, which JAX's threads do not survive.
+    with tempfile.TemporaryDirectory() as folder:
+        film = Path(folder) / "film.mp4"
+        raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", str(rate), "-i", "-"]
+        line = [
+            get_ffmpeg_exe(),
+            "-loglevel",
+            "error",
+            *raw,
+            "-pix_fmt",
+            "yuv420p",
+            "-movflags",
+            "+faststart",
+            str(film),
+        ]
+        subprocess.run(line, input=b"".join(each.tobytes() for each in pictures), check=True)
+        write_whole(path, film.read_bytes())
+
+
+def frames(recording: Recording, size: tuple[int, int] = (1280, 720), rate: float = 30.0) -> Iterator[np.ndarray]:
+    """The pictures (height, width, 3) of a film, 0 to 255."""
+    approach = nearest_approach(recording.path, recording.target)
+    camera = Camera.of(_seen(recording, approach), size[1] / size[0])
+    across = size[1] / size[0]
+    ground = None
+    for time in (None, *_times(recording, approach, rate)):
+        figure = Figure((size[0] / DOTS, size[1] / DOTS), DOTS, facecolor=SKY)
+        canvas = FigureCanvasAgg(figure)
+        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(-1.0, 1.0), ylim=(-across, across))
+        axes.set_axis_off()
+        if time is None or ground is None:
+            _ground(axes, camera)
+        else:
+            figure.figimage(ground, zorder=-1)
+            _scene(axes, camera, recording, approach, time)
+        canvas.draw()
+        picture = np.asarray(canvas.buffer_rgba())[..., :3].copy()
+        if ground is None:
+            ground = picture
+        else:
+            yield picture
+
+
+class Camera(NamedTuple):
+    """A pinhole. place: (3,) [m]. axes: (3, 3), its right, up and forwards in rows."""
+
+    place: np.ndarray
+    axes: np.ndarray
+
+    @classmethod
+    def of(cls, points: np.ndarray, aspect: float) -> Camera:
+        """The nearest one, looking the usual way, that has all of (P, 3) [m] in a picture of height `aspect`."""
+        forwards = np.array([np.cos(AZIMUTH), np.sin(AZIMUTH), -np.tan(ELEVATION)])
+        forwards /= np.linalg.norm(forwards)
+        right = np.cross(forwards, (0.0, 0.0, 1.0))
+        right /= np.linalg.norm(right)
+        axes = np.stack([right, np.cross(right, forwards), forwards])
+        x, y, depth = (points @ axes.T).T
+        place = np.zeros(3)
+        back = np.inf
+        # A point is in the picture where |x - place| <= tangent (depth - back): two bounds on each side.
+        for axis, (across, tangent) in enumerate(((x, TANGENT), (y, TANGENT * aspect))):
+            high, low = (across - tangent * depth).max(), (-across - tangent * depth).max()
+            place[axis] = 0.5 * (high - low)
+            back = min(back, -0.5 * (high + low) / tangent)
+        place[2] = back
+        return cls(place @ axes, axes)
+
+    def depth(self, points: np.ndarray) -> np.ndarray:
+        """How far ahead points (*, 3) are [m]."""
+        return np.asarray((points - self.place) @ self.axes[2])
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """Where points (*, 3) [m] are in the picture, (*, 2), its width from -1 to 1."""
+        seen = (points - self.place) @ self.axes.T
+        return np.asarray(seen[..., :2] / (TANGENT * seen[..., 2:]))
+
+    def sphere(self, centre: np.ndarray, radius: float) -> tuple[np.ndarray, float]:
+        """Middle (2,) and radius of a sphere in the picture; that it is an ellipse there is not seen."""
+        return self(centre), radius / (TANGENT * float(self.depth(centre)))
+
+
+def _times(recording: Recording, approach: Approach, rate: float) -> Iterator[float]:
+    """The moments [s] of the film's pictures."""
+    slow = min(approach.row * recording.scene.dt + LINGER, recording.duration)
+    yield from np.arange(0.0, slow, SLOW / rate)
+    yield from np.arange(slow, recording.duration, 1.0 / rate)
+
+
+def _seen(recording: Recording, approach: Approach) -> np.ndarray:
+    """Points (P, 3) [m] that the camera must have in its picture: the human's, and the ball's up to the target."""
+    ball = recording.traced % len(recording.scene.links)
+    links = np.delete(recording.states[::5], ball, axis=1)[..., POSITION].reshape(-1, 3)
+    way = recording.path[: approach.row + 2]
+    points = np.concatenate([links, way, np.asarray(recording.target, float)[None]])
+    corners = MARGIN * np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    return (points[:, None] + corners).reshape(-1, 3)
+
+
+def _ground(axes: Axes, camera: Camera) -> None:
+    """A grid of metres that fades away; it never moves, so that it is drawn once."""
+    horizon = float(camera(camera.place + 1e4 * (camera.axes[2] * (1.0, 1.0, 0.0)))[1])
+    axes.axhspan(-1.0, horizon, color=GROUND, zorder=0)
+    middle = np.round(camera.place + 0.5 * FAR * camera.axes[2])
+    for along, across in ((0, 1), (1, 0)):
+        for shift in np.arange(-FAR, FAR + 1.0):
+            line = np.zeros((8 * int(FAR), 3))
+            line[:, along] = middle[along] + np.linspace(-FAR, FAR, len(line))
+            line[:, across] = middle[across] + shift
+            line = line[camera.depth(line) > NEAR]
+            if len(line) > 1:
+                fade = np.clip(1.0 - camera.depth(line[1:]) / FAR, 0.0, 1.0)
+                colours = [(*to_rgb(LINES), share) for share in fade]
+                segments = np.stack([camera(line[:-1]), camera(line[1:])], axis=1)
+                axes.add_collection(LineCollection(list(segments), colors=colours, lw=0.8, zorder=0.1))
+
+
+def _scene(axes: Axes, camera: Camera, recording: Recording, approach: Approach, time: float) -> None:
+    """All that moves, at a time [s]."""
+    dt, target = recording.scene.dt, np.asarray(recording.target, float)
+    row = min(int(time / dt), len(recording.states) - 1)
+    state, traced = recording.states[row], recording.traced % len(recording.scene.links)
+    shadows, links = [], []
+    for index, link in enumerate(recording.scene.links):
+        turned = Rotation.from_quat(state[index, ORIENTATION], scalar_first=True)
+        reach = 0.5 * link.length * turned.apply(link.axis)
+        ends = state[index, POSITION] + np.stack([reach, -reach])
+        shadows.append(_shadow(camera, ends, link.radius))
+        if index == traced:
+            continue
+        shift = np.array([0.0, 0.0, 0.3]) - 0.15 * camera.axes[0]  # towards the light
+        colour = link_colour(link)
+        lit = _hull(camera, ends + link.radius * shift, 0.55 * link.radius)
+        links.append((float(camera.depth(ends).mean()), (_hull(camera, ends, link.radius), colour, lit)))
+    axes.add_collection(PolyCollection(shadows, facecolors=SHADOW, edgecolors="none", zorder=0.2))
+    goal, size = camera.sphere(target, recording.radius)
+    _disc(axes, goal, size, fc=_rgb(TARGET), alpha=0.35, ec=_rgb(TARGET), lw=1.5, zorder=1)
+    ways: list[tuple[np.ndarray, Colour, Any, float]] = [(recording.path[: row + 1], TRUTH, "-", 2.5)]
+    if recording.predicted_path is not None:
+        ways.append((recording.predicted_path, PREDICTION, (0, (4, 3)), 1.6))
+    for way, colour, style, width in ways:
+        seen = way[camera.depth(way) > NEAR]
+        axes.plot(*camera(seen).T, color=_rgb(colour), ls=style, lw=width, zorder=2, solid_capstyle="round")
+    # The ball is drawn where it is among the links: behind those that are nearer.
+    far = camera.depth(state[traced, POSITION])
+    order = sorted(links, key=lambda each: -each[0])
+    for layer, (depth, (outline, colour, lit)) in enumerate(order):
+        above = 3.0 + 0.01 * layer + (1.0 if depth < far else 0.0)
+        polygons = PolyCollection([outline], facecolors=[_rgb(colour)], edgecolors="white", lw=0.8, zorder=above)
+        axes.add_collection(polygons)
+        shine = tuple(1.0 - 0.78 * (1.0 - part) for part in _rgb(colour))
+        axes.add_collection(PolyCollection([lit], facecolors=[shine], edgecolors="none", zorder=above))
+    _ball(axes, camera, state[traced], recording.radius)
+    expected = recording.predicted_at(row)
+    if expected is not None:
+        middle, size = camera.sphere(expected[traced, POSITION], recording.radius)
+        _disc(axes, middle, size, fill=False, ec=_rgb(PREDICTION), lw=1.6, ls=(0, (4, 3)), zorder=3.9)
+    passed = row > approach.row
+    if passed:
+        ends = camera(np.stack([approach.point, target]))
+        axes.plot(*ends.T, color=INK, lw=1.5, zorder=5)
+        text = f"{100.0 * approach.distance:.1f} cm from the target"
+        axes.annotate(
+            text,
+            (float(goal[0]), float(goal[1])),
+            (0.0, 26.0),
+            textcoords="offset points",
+            ha="center",
+            fontsize=13,
+            color=INK,
+            zorder=6,
+        )
+    slow = time < approach.row * dt + LINGER
+    pace = f"{time:.2f} s" + (f", at {SLOW:g} of its speed" if slow else "")
+    axes.text(0.025, 0.95, recording.title or "Kick", transform=axes.transAxes, fontsize=17, weight="bold", va="top")
+    axes.text(0.025, 0.885, pace, transform=axes.transAxes, fontsize=12, color=QUIET, va="top")
+    for line, (what, colour) in enumerate((("truth (MuJoCo)", TRUTH), ("prediction", PREDICTION), ("target", TARGET))):
+        axes.text(
+            0.975, 0.95 - 0.045 * line, what, transform=axes.transAxes, fontsize=12, ha="right", va="top",
+            color=_rgb(colour),
+        )  # fmt: skip
+
+
+def _ball(axes: Axes, camera: Camera, state: np.ndarray, radius: float) -> None:
+    """A white disc, and of its dark patches those that face the camera."""
+    centre = state[POSITION]
+    middle, size = camera.sphere(centre, radius)
+    _disc(axes, middle, size, fc=_rgb(BALL_PATCHES[0]), ec=INK, lw=1.2, zorder=3.8)
+    vertices, faces = football_meshes(radius, subdivisions=1)[1]
+    turned = Rotation.from_quat(state[ORIENTATION], scalar_first=True).apply(vertices)
+    towards = camera.place - centre
+    facing = (turned[faces].mean(axis=1) @ towards) > 0.15 * radius * np.linalg.norm(towards)
+    patches = camera(centre + turned)[faces[facing]]
+    dark = _rgb(BALL_PATCHES[1])
+    axes.add_collection(PolyCollection(patches, facecolors=[dark], edgecolors=[dark], lw=0.3, zorder=3.81))
+
+
+def _hull(camera: Camera, ends: np.ndarray, radius: float) -> np.ndarray:
+    """The outline (P, 2) of a capsule between ends (2, 3) [m] in the picture."""
+    discs = [camera.sphere(end, radius) for end in ends]
+    return _wrapped(np.concatenate([middle + size * CIRCLE for middle, size in discs]))
+
+
+def _shadow(camera: Camera, ends: np.ndarray, radius: float) -> np.ndarray:
+    """The outline (P, 2), in the picture, of what a capsule keeps from the ground."""
+    on_ground = ends + np.maximum(ends[:, 2:], 0.0) * LIGHT
+    discs = np.concatenate([end[:2] + radius * CIRCLE for end in on_ground])
+    return _wrapped(camera(np.pad(discs, ((0, 0), (0, 1)))))
+
+
+def _wrapped(points: np.ndarray) -> np.ndarray:
+    return points[ConvexHull(points).vertices]
+
+
+def _disc(axes: Axes, middle: np.ndarray, size: float, **style: Any) -> None:
+    axes.add_patch(Circle((float(middle[0]), float(middle[1])), size, **style))
+
+
+def _rgb(colour: Colour) -> tuple[float, float, float]:
+    return colour[0] / 255.0, colour[1] / 255.0, colour[2] / 255.0
