@@ -13,11 +13,12 @@ from jax import Array
 
 from larp_model import kinematics, rotation
 from larp_model import state as packed
+from larp_model.meeting import first_contacts
 from larp_model.networks import Weights
 from larp_model.parts.part import Model
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
-from larp_model.training import Trajectories, first_contacts
+from larp_model.state import Trajectories
 
 # The launch is read this many steps after first contact, of balls faster than this [m/s].
 LAUNCH_STEPS = 8

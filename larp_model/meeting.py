@@ -6,6 +6,7 @@ Physics alone; what the contact network makes of it is in `parts.contact`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -19,6 +20,7 @@ from larp_model.compliance import HELD, compliance
 from larp_model.contact import Closest, Segment
 from larp_model.kinematics import Kinematics, kinematics, picked
 from larp_model.scene import Body, Pair, Scene
+from larp_model.state import Trajectories
 
 
 @dataclass(frozen=True)
@@ -255,3 +257,10 @@ def first_contact(scene: Scene, states: Array, morphology: Array) -> Array:
     by_time = jnp.moveaxis(states, 1, 0)
     _, hits = jax.lax.scan(advance, None, (by_time[:-1], by_time[1:]))
     return jnp.where(hits.any(axis=0), jnp.argmax(hits, axis=0), -1)
+
+
+def first_contacts(scene: Scene, episodes: Trajectories, chunk: int = 512) -> np.ndarray:
+    """`first_contact` (E,) of many trajectories, chunk by chunk."""
+    found, count = jax.jit(partial(first_contact, scene)), len(episodes.states)
+    rows = np.minimum(np.arange(count + -count % chunk), count - 1).reshape(-1, chunk)
+    return np.concatenate([found(episodes.states[each], episodes.morphology[each]) for each in rows])[:count]

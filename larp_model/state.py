@@ -6,9 +6,10 @@ Columns: position of the centre of mass [m], orientation quaternion (w, x, y, z)
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 SIZE = 13
@@ -52,3 +53,16 @@ def healthy(state: Any) -> Any:
     for columns, limit in LIMITS:
         found = found & xp.all(xp.abs(state[..., columns]) < limit, axis=(-2, -1))
     return found
+
+
+class Trajectories(Protocol):
+    """Recorded truth: see `truth.episodes.Episodes`."""
+
+    @property
+    def states(self) -> np.ndarray: ...
+    @property
+    def controls(self) -> np.ndarray: ...
+    @property
+    def torques(self) -> np.ndarray: ...
+    @property
+    def morphology(self) -> np.ndarray: ...

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,28 +20,17 @@ from jax import Array
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from tensorboardX import SummaryWriter
 
-from larp_model import losses, meeting, rotation
+from larp_model import losses, rotation
 from larp_model.losses import LossWeights
+from larp_model.meeting import first_contacts
 from larp_model.networks import Weights
 from larp_model.parts.part import Model, initial_weights, measure
 from larp_model.scene import Scene
 from larp_model.simulator import rollout
+from larp_model.state import Trajectories
 
 # Updates by which it is judged how many fit into a time.
 TIMED = 20
-
-
-class Trajectories(Protocol):
-    """Recorded truth: see `truth.episodes.Episodes`."""
-
-    @property
-    def states(self) -> np.ndarray: ...
-    @property
-    def controls(self) -> np.ndarray: ...
-    @property
-    def torques(self) -> np.ndarray: ...
-    @property
-    def morphology(self) -> np.ndarray: ...
 
 
 @dataclass(frozen=True)
@@ -143,13 +132,6 @@ class Windows:
                 )
             )
         return Batch(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-
-
-def first_contacts(scene: Scene, episodes: Trajectories, chunk: int = 512) -> np.ndarray:
-    """`meeting.first_contact` (E,) of many trajectories, chunk by chunk."""
-    found, count = jax.jit(partial(meeting.first_contact, scene)), len(episodes.states)
-    rows = np.minimum(np.arange(count + -count % chunk), count - 1).reshape(-1, chunk)
-    return np.concatenate([found(episodes.states[each], episodes.morphology[each]) for each in rows])[:count]
 
 
 def statistics_of(model: Model, windows: Windows, random: np.random.Generator, batches: int = 32) -> Weights:

@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation
 from larp_model import state as packed
 from larp_model.bodies import segment_of
 from larp_model.kinematics import morphology_of
-from larp_model.meeting import meetings
+from larp_model.meeting import first_contacts, meetings
 from larp_model.scene import Link, Scene
-from larp_model.training import first_contacts
 from larp_model.truth.episodes import Episodes, record
 from larp_model.truth.mujoco import Truth, closed
 from tasks.motions.people import random_people

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
@@ -44,17 +47,15 @@ def events(scene: Scene, states: np.ndarray, untouched: np.ndarray | None = None
         return none
     ball = states[:, -1]
     radius = scene.links[-1].radius
-    before = jnp.asarray(states[contact - 1 : contact])
-    [(pair, met)] = meetings(scene.between, before, morphology_of(scene)[None])
-    nearest = int(np.argmin(np.asarray(met.gap[0] - met.near[0])))
+    nearest, normal = _nearest(scene, states[contact - 1])
     launch = ball[min(contact + LAUNCH_STEPS, len(ball) - 1), packed.VELOCITY]
     height = ball[contact:, 2] - radius
     flying = height > FLYING
     down = np.flatnonzero((height < LANDED) & (np.cumsum(flying) > 0))
     return none | {
         "contact_s": contact * scene.dt,
-        "contact_link": pair.first_links[nearest // len(pair.second_links)],
-        "contact_point_m": _list(-radius * np.asarray(met.normal[0, nearest])),
+        "contact_link": nearest,
+        "contact_point_m": _list(-radius * normal),
         "launch_m_s": _list(launch),
         "landing_m": _list(ball[contact + down[0], :2]) if len(down) else None,
     }
@@ -116,6 +117,20 @@ def joint_rotations(scene: Scene, state: np.ndarray) -> Rotation:
     joints = scene.bodies[0].joints
     parents = [joint.parent for joint in joints]
     return turned[parents].inv() * turned[1 : len(joints) + 1]
+
+
+def _nearest(scene: Scene, state: np.ndarray) -> tuple[str, np.ndarray]:
+    """The human's link that meets the ball first from a state (L, 13) on, and the direction (3,) in which it does."""
+    [pair] = scene.between.pairs
+    gaps, normals = _approached(scene.between, jnp.asarray(state))
+    nearest = int(np.argmin(gaps))
+    return pair.first_links[nearest // len(pair.second_links)], np.asarray(normals[nearest])
+
+
+@partial(jax.jit, static_argnums=0)
+def _approached(scene: Scene, state: Array) -> tuple[Array, Array]:
+    [(_, met)] = meetings(scene, state[None], morphology_of(scene)[None])
+    return met.gap[0] - met.near[0], met.normal[0]
 
 
 def _list(values: np.ndarray) -> list[float]:

@@ -15,12 +15,12 @@ from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.bodies import capsule, two_chains
 from larp_model.kinematics import kinematics, morphology_of
+from larp_model.meeting import first_contacts
 from larp_model.parts.articulated import Articulated
 from larp_model.parts.bases import OverMechanics
 from larp_model.parts.part import Hits, initial_weights, measure
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator, rollout
-from larp_model.training import first_contacts
 from tasks.scenarios import scenario
 
 STEPS = 5

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from larp_model import kinematics
 from larp_model import state as packed
 from larp_model.bodies import human, human_and_ball
+from larp_model.meeting import first_contacts
 from larp_model.scene import Body
-from larp_model.training import first_contacts
 from larp_model.truth.mujoco import Truth
 from tasks.motions import references, styles
 from tasks.motions.details import in_detail

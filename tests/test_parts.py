@@ -16,11 +16,11 @@ from jax import Array
 from larp_model import designs, rotation
 from larp_model import state as packed
 from larp_model.kinematics import kinematics, morphology_of
+from larp_model.meeting import first_contacts
 from larp_model.networks import Weights
 from larp_model.parts.contact import Contact
 from larp_model.parts.part import Hits, Model, initial_weights, measure
 from larp_model.simulator import step
-from larp_model.training import first_contacts
 from larp_model.truth.episodes import Episodes
 from tasks.scenarios import scenario
 

@@ -1,16 +1,58 @@
-"""What the README says in Python is run as it stands there."""
+"""What the README says is so: its Python runs as it stands there, its commands take what they are given."""
+
+from __future__ import annotations
 
 import re
+import shlex
+from collections.abc import Callable
+from functools import wraps
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+import tyro
+
+from tasks.benchmarks.__main__ import NAMED
 
 README = Path(__file__).parents[1] / "README.md"
+INSTALLED = {"larp-kick": "tasks.kick", "larp-train": "tasks.train", "larp-adapt": "tasks.adapt"}
+FENCED = re.compile(r"```[a-z]*\n(.*?)```", re.DOTALL)
+TEXT = README.read_text()
+LINES = [
+    shlex.split(line, comments=True)
+    for block in [*FENCED.findall(TEXT), *re.findall(r"`([^`]+)`", FENCED.sub("", TEXT))]
+    for line in block.splitlines()
+    if re.match(r"larp-(kick|train|adapt|bench) |\S*python -m tasks\.", line)
+]
+
+
+def idle(main: Callable[..., None]) -> Callable[..., None]:
+    """A command that takes what the other takes, and does nothing."""
+
+    @wraps(main)
+    def nothing(*arguments: object, **named: object) -> None: ...
+
+    return nothing
+
+
+@pytest.mark.parametrize("line", LINES, ids=" ".join)
+def test_every_command_of_the_readme_takes_what_it_is_given(line: list[str]) -> None:
+    module, given = (line[2], line[3:]) if line[1] == "-m" else (INSTALLED[line[0]], line[1:])
+    if module.startswith("tasks.benchmarks"):
+        given = [module.rpartition(".")[2], *given]
+        tyro.extras.subcommand_cli_from_dict({name: idle(main) for name, main in NAMED.items()}, args=given)
+    elif given not in (["--help"], ["--tyro-print-completion", "bash"]):
+        tyro.cli(idle(import_module(module).main), args=given)
+
+
+def test_every_file_that_the_readme_names_exists() -> None:
+    for name in re.findall(r"\]\(([^)#]+)\)", TEXT):
+        assert (README.parent / name).exists(), name
 
 
 def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    blocks = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
     assert len(blocks) >= 2
     names: dict[str, object] = {}
     for block in blocks:

@@ -13,10 +13,10 @@ from larp_model import kinematics
 from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.designs import DesignName
+from larp_model.meeting import first_contacts
 from larp_model.parts.articulated import Articulated
 from larp_model.parts.paper import PaperBody
 from larp_model.parts.part import BodyPart
-from larp_model.training import first_contacts
 from larp_model.truth.episodes import Episodes
 from tasks import train
 from tasks.benchmarks import model

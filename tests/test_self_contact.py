@@ -14,12 +14,12 @@ from larp_model import designs
 from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.bodies import human_and_ball
-from larp_model.meeting import meetings
+from larp_model.meeting import first_contacts, meetings
 from larp_model.networks import Weights
 from larp_model.parts.part import Model, initial_weights, measure
 from larp_model.scene import Scene
 from larp_model.simulator import step
-from larp_model.training import Recipe, Windows, first_contacts
+from larp_model.training import Recipe, Windows
 from larp_model.truth.episodes import Episodes, record
 from larp_model.truth.mujoco import Truth, closed
 from tasks.data import overlaps

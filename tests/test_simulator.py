@@ -17,12 +17,12 @@ from larp_model import state as packed
 from larp_model.bodies import BALL_SURFACE, capsule, chain
 from larp_model.kinematics import morphology_of
 from larp_model.losses import LossWeights
+from larp_model.meeting import first_contacts
 from larp_model.networks import Size, Weights
 from larp_model.parts.articulated import changes_between, integrate
 from larp_model.parts.part import Model, initial_weights, measure
 from larp_model.scene import Pair, Scene
 from larp_model.simulator import Simulator, rollout
-from larp_model.training import first_contacts
 from larp_model.truth.episodes import Episodes
 
 STEPS = 10

@@ -17,10 +17,11 @@ from matplotlib.image import imread
 
 from larp_model import designs, training
 from larp_model.bodies import chain, two_balls
+from larp_model.meeting import first_contacts
 from larp_model.networks import Weights
 from larp_model.parts.part import Model
 from larp_model.scene import Scene
-from larp_model.training import Batch, Recipe, Windows, first_contacts, statistics_of, train
+from larp_model.training import Batch, Recipe, Windows, statistics_of, train
 from larp_model.truth.episodes import Episodes, record
 from larp_model.truth.mujoco import Truth
 from tasks.curve import curve_picture

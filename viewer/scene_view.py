@@ -8,6 +8,8 @@ from itertools import combinations
 
 import numpy as np
 import viser
+from trimesh.creation import capsule
+from trimesh.geometry import align_vectors
 
 from larp_model.scene import Link, Scene, Vector
 from larp_model.state import ORIENTATION, POSITION, SIZE
@@ -36,17 +38,8 @@ def weld(triangles: np.ndarray) -> Mesh:
 
 def capsule_mesh(length: float, radius: float, axis: Vector = (0.0, 0.0, 1.0), sides: int = 32) -> Mesh:
     """A capsule at the origin; length [m] between its hemispheres' centres, 0 makes a ball; radius [m]."""
-    latitude = np.linspace(0.0, 0.5 * np.pi, sides // 4 + 1)
-    height, width = 0.5 * length + radius * np.sin(latitude), radius * np.cos(latitude)
-    height, width = np.concatenate([-height[::-1], height]), np.concatenate([width[::-1], width])
-    angle = np.linspace(0.0, 2.0 * np.pi, sides + 1)
-    along = np.asarray(axis, float)
-    side = np.cross(np.eye(3)[np.argmin(np.abs(along))], along)
-    side /= np.linalg.norm(side)
-    ring = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * np.cross(along, side)
-    grid = height[:, None, None] * along + width[:, None, None] * ring
-    a, b, c, d = grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]
-    return weld(np.stack([np.stack([a, b, c], axis=-2), np.stack([a, c, d], axis=-2)]).reshape(-1, 3, 3))
+    upright = capsule(length, radius, count=(sides // 2, sides), transform=align_vectors((0.0, 0.0, 1.0), axis))
+    return upright.vertices.astype(np.float32), upright.faces.astype(np.uint32)
 
 
 @cache

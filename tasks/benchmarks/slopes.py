@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from larp_model import state as packed
-from larp_model.training import first_contacts
+from larp_model.meeting import first_contacts
 from mpc import CEM, Dynamics, Gradient, evaluate
 from mpc.search import coloured_noise
 from tasks.benchmarks.pushes import Bench, in_double, row

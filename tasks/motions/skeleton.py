@@ -6,7 +6,6 @@ import re
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation, Slerp
 
 from larp_model.scene import Body
@@ -157,6 +156,8 @@ def toe_velocity(motion: Motion, side: str) -> np.ndarray:
 
     The slope of a parabola fitted to 5 frames (Savitzky and Golay), which evens out a marker that jumps in one frame.
     """
+    from scipy.signal import savgol_filter  # half a second to import; the embedded kick has no need of it
+
     if len(motion.positions) < SMOOTHING:
         raise ValueError(f"motion has {len(motion.positions)} frames, but speeds need {SMOOTHING}")
     return savgol_filter(motion.path(f"{side}ToeBase"), SMOOTHING, 2, deriv=1, delta=1.0 / motion.rate, axis=0)
