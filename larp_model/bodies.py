@@ -131,13 +131,13 @@ def human_and_ball(
 
     self_contact: whether one leg can touch the other, below the knee; else they pass through each other.
     """
-    scene = _kicking(human(height=height, mass=mass, detail=detail), ball(), dt)
+    scene = kicking(human(height=height, mass=mass, detail=detail), ball(), dt)
     return replace(scene, pairs=(*scene.pairs, _legs(scene.bodies[0]))) if self_contact else scene
 
 
 def human_and_capsule(height: float = 1.75, mass: float = 70.0, dt: float = 0.01) -> Scene:
     """A human who can kick a capsule with thighs, shins and feet."""
-    return _kicking(human(height=height, mass=mass), capsule(), dt)
+    return kicking(human(height=height, mass=mass), capsule(), dt)
 
 
 def kicking_links(person: Body) -> tuple[str, ...]:
@@ -152,7 +152,8 @@ def _legs(person: Body) -> Pair:
     return Pair(person.name, person.name, left, right, LEG_SURFACE)
 
 
-def _kicking(person: Body, struck: Body, dt: float) -> Scene:
+def kicking(person: Body, struck: Body, dt: float = 0.01) -> Scene:
+    """The scene of a human and what it kicks, of one link or more, with its `kicking_links`."""
     touching = tuple(link.name for link in struck.links)
     return Scene(
         (person, struck), (Pair(person.name, struck.name, kicking_links(person), touching, struck.surface),), dt

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from larp_model import state as packed
@@ -129,3 +130,10 @@ def turn_states(state: Array, turn: Array) -> Array:
         about_z(packed.velocity(state), turn),
         about_z(packed.angular_velocity(state), turn),
     )
+
+
+def turned_about_z(states: np.ndarray, angle: np.ndarray | float) -> np.ndarray:
+    """NumPy's states (*, L, 13) turned about the world's z by angles (*,) [rad], in 64 bits; see `turn_states`."""
+    with jax.enable_x64(True):
+        turn = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        return np.array(turn_states(jnp.asarray(states, float), jnp.asarray(turn, float)))

@@ -18,7 +18,6 @@ import optax
 import orbax.checkpoint as ocp
 from jax import Array
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-from tensorboardX import SummaryWriter
 
 from larp_model import losses, rotation
 from larp_model.losses import LossWeights
@@ -189,6 +188,8 @@ def train(
     weights to go on from; what they lack begins fresh. seconds: only as many of the updates as fit into them, judged by
     the first. Where a hundred batches in a row are dropped, the last good weights are returned and the log says so.
     """
+    from tensorboardX import SummaryWriter  # whose import sets a variable of the environment
+
     random = np.random.default_rng(recipe.seed)
     scene, windows = model.scene, Windows(model.scene, sources, recipe)
     weights = begun(model, windows, random, start)

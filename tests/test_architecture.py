@@ -18,6 +18,7 @@ ORDER = [
     "larp_model.scene",
     "larp_model.anatomy",
     "larp_model.bodies",
+    "larp_model.mjcf",
     "larp_model.state",
     "larp_model.rotation",
     "larp_model.vector",

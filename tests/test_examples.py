@@ -21,7 +21,8 @@ def test_a_task_from_outside_meets_its_goals(tmp_path: Path, monkeypatch: pytest
 
 
 @pytest.mark.parametrize(
-    ("name", "given"), [("own_cost", ()), ("own_reference", ()), ("own_world", ()), ("own_model", ()), ("batch", (2,))]
+    ("name", "given"),
+    [("own_cost", ()), ("own_reference", ()), ("own_world", ()), ("own_model", ()), ("own_human", ()), ("batch", (2,))],
 )
 def test_what_an_example_says_of_itself_holds(
     name: str, given: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -45,7 +46,7 @@ def test_the_notebook_runs_and_shows_its_replay(tmp_path: Path, monkeypatch: pyt
 
 
 def test_every_example_is_run() -> None:
-    run = {"pass_to_runner", "own_cost", "own_reference", "own_world", "own_model", "batch"}
+    run = {"pass_to_runner", "own_cost", "own_reference", "own_world", "own_model", "own_human", "batch"}
     assert {path.stem for path in EXAMPLES.glob("*.py")} == run
 
 

@@ -156,3 +156,19 @@ def test_gradients_are_finite_where_angles_are_degenerate(
 
 def test_heading_of_a_body_on_its_head_is_x() -> None:
     np.testing.assert_array_equal(rotation.heading(jnp.asarray(UPSIDE_DOWN)), [1.0, 0.0])
+
+
+@pytest.mark.parametrize("angle", [0.7, np.array([0.7, -2.0, 4.0])], ids=["one", "each its own"])
+def test_states_turned_about_z_move_as_one_body_to_64_bits(angle: np.ndarray | float) -> None:
+    random = np.random.default_rng(1)
+    states = random.standard_normal((3, 5, 13))
+    states[..., 3:7] = quaternions(8, 15)[:15].reshape(3, 5, 4)
+    with jax.enable_x64(False):
+        turned = rotation.turned_about_z(states, angle)
+    turns = Rotation.from_rotvec(np.broadcast_to(angle, 3)[:, None] * (0.0, 0.0, 1.0))
+    for row, turn in enumerate(turns):
+        for vector in (slice(0, 3), slice(7, 10), slice(10, 13)):
+            np.testing.assert_allclose(turned[row, :, vector], turn.apply(states[row, :, vector]), atol=1e-14)
+        found = Rotation.from_quat(turned[row, :, 3:7], scalar_first=True)
+        expected = turn * Rotation.from_quat(states[row, :, 3:7], scalar_first=True)
+        np.testing.assert_allclose(found.as_matrix(), expected.as_matrix(), atol=1e-14)

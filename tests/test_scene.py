@@ -86,10 +86,10 @@ def test_a_description_refuses_nonsense_by_field(description: Link, field: str, 
         (lambda: chain(links=1.5), "links is 1.5"),  # type: ignore[arg-type]
         (lambda: human(height=-1.75), "height is -1.75"),
         (lambda: human(mass=0.0), "mass is 0.0"),
-        (lambda: human(lengths={"tail": 1.0}), "lengths names 'tail'"),
+        (lambda: human(lengths={"tail": 1.0}), "lengths is 'tail'"),
         (lambda: human(radii={"shin": 0.0}), "radii"),
-        (lambda: human(lengths={"toes": 1.0}), "lengths names 'toes'"),
-        (lambda: human(motors={"tail": 1.0}), "motors names 'tail'"),
+        (lambda: human(lengths={"toes": 1.0}), "lengths is 'toes'"),
+        (lambda: human(motors={"tail": 1.0}), "motors is 'tail'"),
         (lambda: human(detail="fine"), "detail is 'fine', but must be one of lean, full"),  # type: ignore[arg-type]
         (lambda: detail_of(ball()), "'ball' is a ball, but must be one of human, full_human"),
         (lambda: human_and_ball(dt=-0.01), "dt is -0.01"),

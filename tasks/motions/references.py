@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from larp_model import bodies
 from larp_model import state as packed
 from larp_model.bodies import standing_height
+from larp_model.rotation import turned_about_z
 from larp_model.scene import Body, Link, Scene
 from larp_model.truth.mujoco import Truth, closed, finite
 from tasks.motions import angles, bvh, key_poses, skeleton
@@ -171,12 +172,7 @@ def captured(
 def _launched_along_x(states: np.ndarray, strike: int) -> np.ndarray:
     """The states (T, L, 13), turned about z and moved along y so that the ball leaves along the x axis."""
     x, y, _ = states[min(strike + MEETING, len(states) - 1), -1, packed.VELOCITY]
-    turn = Rotation.from_rotvec((0.0, 0.0, -np.arctan2(y, x)))
-    turned = states.copy()
-    for columns in (packed.POSITION, packed.VELOCITY, packed.ANGULAR_VELOCITY):
-        turned[..., columns] = turn.apply(states[..., columns].reshape(-1, 3)).reshape(*states.shape[:2], 3)
-    orientation = turn * Rotation.from_quat(states[..., packed.ORIENTATION].reshape(-1, 4), scalar_first=True)
-    turned[..., packed.ORIENTATION] = orientation.as_quat(scalar_first=True).reshape(*states.shape[:2], 4)
+    turned = turned_about_z(states, -np.arctan2(y, x))
     turned[..., 1] -= turned[0, -1, 1]
     return turned
 

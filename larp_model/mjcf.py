@@ -1,0 +1,225 @@
+"""A humanoid from an MJCF file, in the links and joints of our lean human.
+
+Every body of the file is one of our links, by its name, or rides on the link above it; the hinges between two links
+become one ball joint, where they are on average, and what is welded is held by a servo. Links keep their mass, the
+place of their joints, and the length and volume of their geoms; legs and arms are put to hang, as ours do in rest, and
+servos and bounds of joints are ours, in proportion. What cannot be said in that way is refused by name.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
+
+from larp_model.bodies import human, segment_of
+from larp_model.names import require_file, require_known
+from larp_model.scene import Body, Joint, Link, Vector
+
+# What files call our segments, apart from sides.
+SYNONYMS = {
+    "pelvis": ("pelvis", "hips"),
+    "torso": ("torso", "chest", "trunk", "spine"),
+    "head": ("head",),
+    "upper_arm": ("upperarm", "uarm", "arm", "shoulder"),
+    "lower_arm": ("lowerarm", "larm", "forearm", "elbow"),
+    "thigh": ("thigh", "upperleg", "upleg"),
+    "shin": ("shin", "lowerleg", "calf", "knee"),
+    "foot": ("foot", "ankle"),
+}
+# Segments that hang down in our rest pose, whatever the file's.
+HANGING = ("upper_arm", "lower_arm", "thigh", "shin")
+# A ball is made so much longer, in its radius: places on a link are told along it, in its length.
+ROUNDEST = 0.1
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+class Placed(NamedTuple):
+    """A link as the file has it: ends (G, 2, 3) and radii (G,) of its geoms [m], and its mass [kg]."""
+
+    ends: np.ndarray
+    radii: np.ndarray
+    mass: float
+
+
+class Tie(NamedTuple):
+    """Where a link is tied to its parent (3,) [m], in the middle of its hinges, and whether it is welded there."""
+
+    place: np.ndarray
+    welded: bool
+
+
+def humanoid(source: str | Path, names: Mapping[str, str] | None = None, name: str = "human") -> Body:
+    """The humanoid of an MJCF file as a human of 13 links: see above. `bodies.kicking` gives it a ball.
+
+    It stands along z and faces x. names: what the file calls our links, {"left_shin": "calf_l", ...}; those left out
+    are found by usual names. ValueError where a link is missing, a joint is no hinge or ball, a geom is
+    neither capsule nor sphere, or bodies are tied by more than joints.
+    """
+    path = Path(source)
+    require_file("source", path)
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise ValueError(
+            f"source: {path.name} is no MJCF file that MuJoCo reads: {str(error).splitlines()[0]}"
+        ) from None
+    for what, count in (("equality constraints", model.neq), ("tendons", model.ntendon)):
+        if count:
+            raise ValueError(f"source: {path.name} has {count} {what}, but only joints can tie links")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    usual = human(name)
+    own = _named(path.name, model, [link.name for link in usual.links], dict(names or {}))
+    owners = _owners(path.name, model, own)
+    placed = [_placed(path.name, model, data, owners, link) for link in own]
+    ties = _joints(path.name, model, data, own, usual)
+    return _assembled(usual, placed, ties)
+
+
+def _named(file: str, model: mujoco.MjModel, links: Sequence[str], names: dict[str, str]) -> dict[str, int]:
+    """Which of the file's bodies, by number, each of our links is."""
+    bodies = [model.body(row).name for row in range(1, model.nbody)]
+    for link in names:
+        require_known("names", link, links)
+    own = {}
+    for link in links:
+        wanted = [names[link]] if link in names else [body for body in bodies if usual_name(body) == link]
+        if len(wanted) != 1 or wanted[0] not in bodies:
+            had = "several bodies" if len(wanted) > 1 else "no body"
+            raise ValueError(f"source: {file} has {had} for {link!r}, but needs one; it has {', '.join(bodies)}")
+        own[link] = int(model.body(wanted[0]).id)
+    return own
+
+
+def _owners(file: str, model: mujoco.MjModel, own: Mapping[str, int]) -> dict[int, str]:
+    """Which of our links each of the file's bodies is, or rides on."""
+    owners = {body: link for link, body in own.items()}
+    for body in range(1, model.nbody):  # parents come first
+        above = int(model.body_parentid[body])
+        if body not in owners and above not in owners:
+            raise ValueError(
+                f"source: {file}: {model.body(body).name!r} is none of a human's links, and on none of them"
+            )
+        owners.setdefault(body, owners.get(above, ""))
+    return owners
+
+
+def usual_name(body: str) -> str | None:
+    """Which of our links a body of this name usually is: "R_Thigh", "thigh_right" are the "right_thigh"."""
+    parts = [part for part in re.split(r"[^a-z]+", re.sub(r"([a-z])([A-Z])", r"\1_\2", body).lower()) if part]
+    sides = {"left": "left_", "l": "left_", "right": "right_", "r": "right_"}
+    side = next((sides[part] for part in parts if part in sides), "")
+    word = "".join(part for part in parts if part not in sides)
+    segment = next((ours for ours, theirs in SYNONYMS.items() if word in theirs), None)
+    paired = segment not in ("pelvis", "torso", "head")
+    return None if segment is None or paired != bool(side) else side + segment
+
+
+def _placed(file: str, model: mujoco.MjModel, data: mujoco.MjData, owners: Mapping[int, str], link: str) -> Placed:
+    """What the file has of a link."""
+    rows = [body for body, owner in owners.items() if owner == link]
+    ends, radii = [], []
+    for geom in np.flatnonzero(np.isin(model.geom_bodyid, rows)):
+        kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
+        if kind not in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE):
+            said, body = kind.name.removeprefix("mjGEOM_").lower(), model.body(model.geom_bodyid[geom]).name
+            raise ValueError(f"source: {file}: a geom of {body!r} is a {said}, but must be a capsule or a sphere")
+        half = size[1] * data.geom_xmat[geom].reshape(3, 3)[:, 2] * (kind == mujoco.mjtGeom.mjGEOM_CAPSULE)
+        ends.append((data.geom_xpos[geom] - half, data.geom_xpos[geom] + half))
+        radii.append(size[0])
+    if not ends:
+        raise ValueError(f"source: {file}: {link!r} has no geom, but needs a capsule or a sphere")
+    return Placed(np.array(ends), np.array(radii), float(model.body_mass[rows].sum()))
+
+
+def _joints(
+    file: str, model: mujoco.MjModel, data: mujoco.MjData, own: Mapping[str, int], usual: Body
+) -> dict[str, Tie]:
+    """How each of our links, the root apart, is tied to its parent."""
+    named = {body: link for link, body in own.items()}
+    ties: dict[frozenset[str], Tie] = {}
+    for body in named:
+        passed, above = [body], int(model.body_parentid[body])
+        while above and above not in named:
+            passed, above = [*passed, above], int(model.body_parentid[above])
+        if not above:
+            continue
+        hinges = np.flatnonzero(np.isin(model.jnt_bodyid, passed))
+        for hinge in hinges:
+            kind = mujoco.mjtJoint(model.jnt_type[hinge])
+            if kind not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_BALL):
+                said = kind.name.removeprefix("mjJNT_").lower()
+                raise ValueError(f"source: {file}: joint {model.joint(hinge).name!r} is a {said}, but must be a hinge")
+        place = data.xanchor[hinges].mean(axis=0) if len(hinges) else data.xpos[body]
+        ties[frozenset((named[body], named[above]))] = Tie(place, not len(hinges))
+    found = {}
+    for link, joint in zip(usual.links[1:], usual.joints, strict=True):
+        parent = usual.links[joint.parent].name
+        if (tie := ties.get(frozenset((link.name, parent)))) is None:
+            raise ValueError(f"source: {file} does not tie {link.name!r} to {parent!r}, as a human's are")
+        found[link.name] = tie
+    return found
+
+
+def _assembled(usual: Body, placed: Sequence[Placed], ties: Mapping[str, Tie]) -> Body:
+    """The usual human with links and joints where the file has them, hanging limbs turned down first."""
+    below = {
+        usual.links[joint.parent].name: link.name for link, joint in zip(usual.links[1:], usual.joints, strict=True)
+    }
+    links, centres, turns = [], [], []
+    for link, given in zip(usual.links, placed, strict=True):
+        turn = Rotation.identity()
+        if segment_of(link.name) in HANGING:
+            end = ties[below[link.name]].place if link.name in below else given.ends.mean(axis=(0, 1))
+            turn = Rotation.align_vectors([DOWN], [end - ties[link.name].place])[0]
+        fitted, centre = capsule(link, turn.apply(given.ends.reshape(-1, 3)).reshape(-1, 2, 3), given)
+        links.append(fitted)
+        centres.append(turn.inv().apply(centre))
+        turns.append(turn)
+    sized = usual.sized(np.array([(link.length, link.radius, link.mass) for link in links]))
+
+    def anchor(row: int, place: np.ndarray) -> tuple[float, float, float]:
+        return said(links[row], turns[row].apply(place - centres[row]))
+
+    def tied(child: int, joint: Joint, tie: Tie) -> Joint:
+        held: Vector = (0.0, 0.0, 0.0)
+        motor = replace(joint.motor, lower=held, upper=held) if tie.welded and joint.motor else joint.motor
+        return Joint(joint.parent, anchor(joint.parent, tie.place), anchor(child, tie.place), motor)
+
+    joints = (tied(child, *each) for child, each in enumerate(zip(sized.joints, ties.values(), strict=True), start=1))
+    return replace(sized, links=tuple(links), joints=tuple(joints))
+
+
+def capsule(link: Link, ends: np.ndarray, given: Placed) -> tuple[Link, np.ndarray]:
+    """The capsule along a link's axis that is as long and as voluminous as its geoms, and its centre (3,) [m].
+
+    ends: (G, 2, 3) of the geoms [m]. Of extent E the volume is pi r^2 E - 2 pi r^3 / 3, and grows with r up to a ball.
+    """
+    axis = np.array(link.axis)
+    along, radii = ends @ axis, given.radii
+    low, high = (along.min(axis=1) - radii).min(), (along.max(axis=1) + radii).max()
+    spans = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)
+    volumes = np.pi * radii**2 * (spans + 4.0 / 3.0 * radii)
+    extent, volume = high - low, volumes.sum()
+    radius = 0.5 * extent
+    if volume < np.pi * extent**3 / 6.0:
+        radius = brentq(lambda r: np.pi * r**2 * (extent - 2.0 * r / 3.0) - volume, 0.0, radius)
+    centre = volumes @ ends.mean(axis=1) / volume
+    centre += (0.5 * (low + high) - centre @ axis) * axis
+    return replace(link, length=max(extent - 2.0 * radius, ROUNDEST * radius), radius=radius, mass=given.mass), centre
+
+
+def said(link: Link, place: np.ndarray) -> tuple[float, float, float]:
+    """A place on a link, (3,) from its centre [m], as an anchor; see `scene.Joint`."""
+    axis = np.array(link.axis)
+    along = (place @ axis) * axis
+    x, y, z = along / (0.5 * link.length) + (place - along) / link.radius
+    return float(x), float(y), float(z)
