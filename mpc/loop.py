@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -29,12 +29,13 @@ class Diverged(ValueError):
 class Window(NamedTuple):
     """What the task wants of the next H steps: reference controls (H, J, 3) [rad] and the residuals' context.
 
-    steps: so many of the H suffice; all by default.
+    steps: so many of the H suffice; all by default. weights: of cost terms by name, instead of their own.
     """
 
     controls: np.ndarray
     context: Any
     steps: int | None = None
+    weights: Mapping[str, float] | None = None
 
 
 def never(step: int, state: np.ndarray) -> bool:
@@ -113,7 +114,9 @@ def execute(
             before = planner.init(jax.random.fold_in(key, index), step * dt) if plan is None else plan
             wanted = phase.window(step)
             seen = current[phase.links]
-            plan, info = planner.step(before, seen, wanted.controls, wanted.context, now=step * dt, steps=wanted.steps)
+            plan, info = planner.step(
+                before, seen, wanted.controls, wanted.context, wanted.weights, now=step * dt, steps=wanted.steps
+            )
             targets, planned_at = np.asarray(planner.controls(plan, wanted.controls)), step
             execution.replans.append(Replan(step, index, current, plan, info))
         ahead = step - planned_at

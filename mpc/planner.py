@@ -191,6 +191,26 @@ class Planner:
         _, info = self.step(self.init(jax.random.key(0)), state, reference, context, weights, 0.0, steps)
         return info.compile_seconds
 
+    def fan(
+        self,
+        plan: Plan,
+        state: ArrayLike,
+        reference: ArrayLike,
+        context: Any = None,
+        weights: Mapping[str, float] | None = None,
+        steps: int | None = None,
+        count: int = 16,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What lies around a plan that was just made in `state`, for looking: costs (N,) and states (N, H', L, 13).
+
+        Candidates are drawn with half the plan's spread, the same ones each time. For the other arguments see `step`,
+        whose programs serve here too.
+        """
+        noise = coloured_noise(np.random.default_rng(0), (count, *plan.knots.shape), COLOUR)
+        wanted = self._wanted(plan, state, reference, context, weights, float(plan.start), steps)
+        problem = PlannerProblem(self._equations, self._programs, wanted, plan.knots)
+        return problem.shown(plan.knots + 0.5 * plan.spread * noise)
+
     def controls(self, plan: Plan, reference: ArrayLike) -> jax.Array:
         """Joint targets (H, J, 3) [rad] of the plan, given the reference (H, J, 3) it was made around."""
         return self._controls(plan.knots, self._reference(reference))

@@ -172,13 +172,21 @@ class PlannerProblem:
             self.tries(knots[None])
         return self.record.best[knots.tobytes()]
 
+    def shown(self, knots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Costs (N,) and states (N, H', L, 13) of knots (N, K, J, 3), for looking: they are not recorded."""
+        tried, states = self._rolled(self.equations.dynamics, knots, SIDE_BY_SIDE)
+        return np.asarray(tried[0]), np.asarray(states)
+
     def judged(self, knots: np.ndarray) -> tuple[float, dict[str, float]]:
         """Cost of knots (K, J, 3) and each term's share of it."""
         cost, terms = self.run("judge", self.equations.judge, self.wanted, knots, self.states_of(knots))
         return float(cost), {name: float(value) for name, value in terms.items()}
 
     def _tries(self, dynamics: Dynamics, knots: np.ndarray, size: int) -> Tried:
-        """`size` candidates at a time, the last ones filled up."""
+        return self._recorded(knots, *self._rolled(dynamics, knots, size))
+
+    def _rolled(self, dynamics: Dynamics, knots: np.ndarray, size: int) -> tuple[Any, Any]:
+        """What `weigh` finds of knots, and their states: `size` at a time, the last ones filled up."""
         name, found = ("roll out", id(dynamics)), []
         for begin in range(0, len(knots), size):
             rows = np.minimum(np.arange(begin, begin + size), len(knots) - 1)
@@ -187,9 +195,8 @@ class PlannerProblem:
             tried = self.run("weigh", self.equations.weigh, self.wanted, states, controls, self.corrections)
             found.append((tried, states))
         if len(knots) == size:
-            return self._recorded(knots, *found[0])
-        tried, states = jax.tree.map(lambda *parts: np.concatenate(parts)[: len(knots)], *found)
-        return self._recorded(knots, tried, states)
+            return found[0]
+        return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(knots)], *found)
 
     def _recorded(self, knots: np.ndarray, tried: Any, states: jax.Array) -> Tried:
         found = Tried(*jax.tree.map(np.asarray, tried))

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from jax import Array
@@ -28,12 +28,15 @@ from mpc.loop import Execution
 from tasks import residuals
 from tasks.command import Teller, remember_compilations, run
 from tasks.gap import contact_step, gap, told
+from tasks.live import Choices, Live, weights_for
 from tasks.models import DynamicsName
-from tasks.presets import PresetName, changed, preset_of
-from tasks.task import AFTER_CONTACT, HEIGHT, REACHABLE, Task, checked_target
-from viewer import LivePage, check_film, nearest_approach, write_film
+from tasks.presets import PRESETS, PresetName, changed, preset_of
+from tasks.task import AFTER_CONTACT, HEIGHT, REACHABLE, Run, Task, checked_target
+from viewer import LivePage, Wishes, check_film, nearest_approach, write_film
 
 Pair = np.ndarray | tuple[float, float]
+# A target (3,) [m] like others: straight ahead.
+USUAL = np.array([4.0, 0.0, 0.5])
 
 
 class Kick(Task):
@@ -154,6 +157,7 @@ def main(
     seed: int = 0,
     out: Path = Path("runs/kick"),
     view: bool = False,
+    host: str = "127.0.0.1",
     port: int = 8080,
     video: Path | None = None,
     quiet: bool = False,
@@ -175,7 +179,8 @@ def main(
         self_contact: let one leg touch the other, below the knee; else they pass through each other.
         seed: of the planner's random numbers.
         out: folder for summary.json, kick.npz, kick.png and kick.html.
-        view: show the kick live in the browser, on 127.0.0.1.
+        view: show the kick live in the browser; there, set what you like and kick again.
+        host: of the page; others can use it where they reach the host.
         port: of the page.
         video: a film of the kick to write: FILE.mp4 or FILE.gif.
         quiet: print nothing.
@@ -194,35 +199,41 @@ def main(
     with tell.part("setting up"):
         kick = Kick.standard(reference, height, mass, body, self_contact, names)
         kick.planners(chosen, dynamics, weights)
-    page = LivePage(port=port) if view else None
-    if page:
-        tell(f"watch it at {page.address} (Ctrl-C ends)")
-        page.begin(kick.scene, goal)
+    called = " ".join((preset, *change))
 
-    def observe(execution: Execution) -> None:
-        if page:
-            last, step = kick.plans(execution)[-1], len(execution.states) - 1
-            news = last.info.states[1:] if last.step == step - 1 else None
-            page.update(execution.states[-1], news, step * kick.scene.dt)
+    def finished(kicked: Run) -> None:
+        kicked.summary["preset"] = called
+        replans = [replan.info for replan in kicked.execution.replans]
+        compiling, planning = (sum(getattr(info, name) for info in replans) for name in ("compile_seconds", "seconds"))
+        executing = time.perf_counter() - begin - compiling - planning
+        tell(f"compiling {compiling:.1f} s, planning {planning:.1f} s, executing {executing:.1f} s")
+        with tell.part("writing"):
+            kicked.save(out)
+        if video is not None:
+            with tell.part(f"filming {video}"):
+                write_film(kicked.recording, video)
+        tell.result(kicked.table, kicked.summary)
+        tell(f"{out}/: summary.json, kick.npz, kick.png, kick.html")
 
     begin = time.perf_counter()
-    tell("planning and executing; what is new is compiled first")
-    kicked = kick.to(goal, chosen, dynamics, weights, seed, observe=observe)
-    kicked.summary["preset"] = " ".join((preset, *change))
-    replans = [replan.info for replan in kicked.execution.replans]
-    compiling, planning = (sum(getattr(info, field) for info in replans) for field in ("compile_seconds", "seconds"))
-    executing = time.perf_counter() - begin - compiling - planning
-    tell(f"compiling {compiling:.1f} s, planning {planning:.1f} s, executing {executing:.1f} s")
-    with tell.part("writing"):
-        kicked.save(out)
-    if video is not None:
-        with tell.part(f"filming {video}"):
-            write_film(kicked.recording, video)
-    tell.result(kicked.table, kicked.summary)
-    tell(f"{out}/: summary.json, kick.npz, kick.png, kick.html")
-    if page:
-        page.finish(kicked.recording)
-        page.wait()
+    if not view:
+        tell("planning and executing; what is new is compiled first")
+        finished(kick.to(goal, chosen, dynamics, weights, seed))
+        return
+    tasks: dict[str, Callable[[], Task]] = {"embedded" if reference is None else reference.name: lambda: kick}
+    if reference is not None:
+        tasks["embedded"] = lambda: Kick.standard(None, height, mass, body, self_contact)
+    models = (dynamics, *(each for each in get_args(DynamicsName) if each != dynamics))
+    choices = Choices(tasks, {called: chosen} | PRESETS, models, weights_for(kick, weights))
+    with LivePage(host, port, choices.offer(kick)) as page:
+        tell(f"watch it at {page.address} (Ctrl-C ends)")
+        Live(page, choices, goal, out / "kept", seed, wished, finished).serve("kick")
+
+
+def wished(task: Task, wishes: Wishes) -> np.ndarray:
+    """The state (L, 13) in which a kick begins that is wished for on the page."""
+    assert isinstance(task, Kick)
+    return task.start(np.array(wishes.spot), np.array(wishes.roll))
 
 
 def cli() -> None:

@@ -40,7 +40,7 @@ from tasks.motions import references
 from tasks.motions.bvh import names_in
 from tasks.motions.references import Reference
 from tasks.motions.skeleton import Motion
-from tasks.presets import Preset, PresetName, preset_of, usable
+from tasks.presets import Preset, PresetName, Seconds, preset_of, usable, within
 from tasks.standing import Standing
 from viewer import LivePage, Recording, framed, kick_picture, write_html
 
@@ -92,6 +92,8 @@ class Task(ABC):
         bounds = np.array([(motor.lower, motor.upper) for motor in scene.motors])
         self.lower, self.upper = bounds[:, 0], bounds[:, 1]
         self._planners: dict[tuple[str | Preset, str | int, Path], tuple[Planners, str]] = {}
+        self._models: dict[tuple[str | int, Path], Models] = {}
+        self._bases: dict[int, tuple[Models, Planner, Planner]] = {}  # by the model, with which they are kept
 
     @classmethod
     def standard(
@@ -218,7 +220,10 @@ class Task(ABC):
         )
 
     def planners_of(self, preset: Preset, models: Models) -> Planners:
-        """A preset's planners; where MuJoCo is the model there is nothing to try in the truth."""
+        """A preset's planners; where MuJoCo is the model there is nothing to try in the truth.
+
+        All presets of the same models share what is compiled.
+        """
         first: tuple[Optimizer, ...] = preset.first
         again: tuple[Optimizer, ...] = preset.again
         if any(preset.verify) and models.learned:
@@ -231,12 +236,15 @@ class Task(ABC):
                 else proposing
                 for proposing, rounds in zip((first, again), preset.verify, strict=True)
             )
-        planner = self.planner(models.whole, first)
+        if (known := id(models.whole)) not in self._bases:
+            standing = Standing(self.scene, self.reference).planner(models.human, preset.stand)
+            self._bases[known] = models, self.planner(models.whole, first), standing
+        _, planner, standing = self._bases[known]
         return Planners(
-            planner,
+            planner.using(usable(models.whole, first)),
             planner.using(usable(models.whole, again)),
             preset.every,
-            Standing(self.scene, self.reference).planner(models.human, preset.stand),
+            standing.using(usable(models.human, preset.stand)),
         )
 
     def planners(
@@ -250,12 +258,39 @@ class Task(ABC):
         key = (preset, dynamics if isinstance(dynamics, str) else id(dynamics), manifest)
         if key not in self._planners:
             chosen = preset_of(preset) if isinstance(preset, str) else preset
-            if isinstance(dynamics, str):
-                models = models_of(self.scene, dynamics, manifest)
-            else:
-                models = models_of(self.scene, "larp", manifest)._replace(whole=dynamics, weights="none")
+            models = self.models(dynamics, manifest)
             self._planners[key] = self.planners_of(chosen, models), models.weights
         return self._planners[key]
+
+    def models(self, dynamics: DynamicsName | Dynamics = "larp", weights: str | Path | None = None) -> Models:
+        """The models to plan with, made once; see `to`."""
+        manifest = self.weights if weights is None else Path(weights)
+        key = (dynamics if isinstance(dynamics, str) else id(dynamics), manifest)
+        if key not in self._models:
+            if isinstance(dynamics, str):
+                self._models[key] = models_of(self.scene, dynamics, manifest)
+            else:
+                learned = models_of(self.scene, "larp", manifest)
+                self._models[key] = learned._replace(whole=dynamics, weights="none")
+        return self._models[key]
+
+    def within(self, preset: Preset, budget: float, models: Models, goal: Any) -> Preset:
+        """The preset, scaled to so many seconds a plan; see `presets.within`. goal: any usual one."""
+        return within(preset, budget, partial(self.seconds, models, goal))
+
+    def seconds(self, models: Models, goal: Any, preset: Preset) -> Seconds:
+        """What the preset's plans take for a goal, whole windows of them."""
+        planners, usual = self.planners_of(preset, models), self.window(goal)
+        took = []
+        for planner, window, links in (
+            (planners.first, usual, slice(None)),
+            (planners.again, usual, slice(None)),
+            (planners.stand, Standing(self.scene, self.reference).window, self.human),
+        ):
+            plan, wanted, state = planner.init(jax.random.key(0)), window(0), self.start()[links]
+            runs = [planner.step(plan, state, wanted.controls, wanted.context, steps=wanted.steps) for _ in range(2)]
+            took.append(min(info.seconds for _, info in runs))
+        return Seconds(*took)
 
     def to(
         self,
@@ -294,15 +329,17 @@ class Task(ABC):
         sense: Callable[[np.ndarray], np.ndarray] = lambda state: state,
         stands: bool = True,
         world: World | None = None,
+        window: Callable[[int], Window] | None = None,
     ) -> Execution:
         """Plan and execute in the truth, from a state of `start`, for `steps` or until 2 s after contact.
 
-        stands: whether plans go on after the task is over, to keep the human up. world: to execute in instead.
+        stands: whether plans go on after the task is over, to keep the human up. world: to execute in instead. window:
+        what is wanted from a step on, if it is not always the goal.
         """
         state = self.start() if state is None else state
         steps = self.reference.strike + 20 + AFTER_CONTACT if steps is None else steps
         first, again, every, stand = planners
-        phases = [Phase(first, again, every, self.window(goal), self.over(state, steps), LINGER)]
+        phases = [Phase(first, again, every, window or self.window(goal), self.over(state, steps), LINGER)]
         if stands:
             standing = Standing(self.scene, self.reference)
             phases.append(Phase(stand, stand, STAND_EVERY, standing.window, links=self.human))
@@ -397,6 +434,12 @@ class Run:
         return float(self.summary["model_error_m"])
 
     @property
+    def costs(self) -> dict[str, list[float]]:
+        """Each term's share of the cost, plan by plan."""
+        plans = self.task.plans(self.execution)
+        return {term: [replan.info.terms[term] for replan in plans] for term in plans[-1].info.terms}
+
+    @property
     def recording(self) -> Recording:
         """For the viewer: the truth, the last plan's prediction, the reference."""
         states, begun = self.states, self.task.plans(self.execution)[-1].step
@@ -437,8 +480,7 @@ class Run:
             predicted_states=plans[-1].info.states,
         )
         write_whole(folder / f"{name}.npz", buffer.getvalue())
-        costs = {term: [replan.info.terms[term] for replan in plans] for term in plans[-1].info.terms}
-        kick_picture(recording, costs, folder / f"{name}.png")
+        kick_picture(recording, self.costs, folder / f"{name}.png")
         write_html(recording, folder / f"{name}.html")
         write_whole(folder / "summary.json", (json.dumps(self.summary, indent=2) + "\n").encode())
         return folder

@@ -3,13 +3,11 @@
 import base64
 import re
 import shutil
-import socket
 import subprocess
 import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -21,8 +19,9 @@ from larp_model.bodies import human_and_ball
 from larp_model.scene import Vector
 from larp_model.state import ORIENTATION, POSITION, VELOCITY
 from viewer import LivePage, Recording, check_film, kick_picture, nearest_approach, write_film, write_html
-from viewer.film import Camera, frames
-from viewer.panel import Panel, within
+from viewer.camera import Camera
+from viewer.film import frames
+from viewer.panel import Panel
 from viewer.scene_view import Mesh, capsule_mesh, football_meshes
 
 SCENE = human_and_ball()
@@ -123,29 +122,6 @@ def test_prediction_is_aligned_with_the_truth(recording: Recording) -> None:
         np.testing.assert_allclose(expected[:, 0], recording.states[row, :, 0])
 
 
-def test_page_answers_on_this_machine_only(page: LivePage) -> None:
-    assert re.fullmatch(r"http://127\.0\.0\.1:\d+", page.address)
-    with urlopen(page.address, timeout=5) as answer:
-        assert b"<html" in answer.read().lower()
-    port = int(page.address.rpartition(":")[2])
-    with pytest.raises(OSError):  # a page on all addresses would answer on this one too
-        socket.create_connection(("127.0.0.2", port), timeout=1).close()
-
-
-def test_busy_port_is_refused(page: LivePage) -> None:
-    port = int(page.address.rpartition(":")[2])
-    with pytest.raises(ValueError, match=f"^port {port} of host '127.0.0.1' cannot be opened") as caught:
-        LivePage(port=port)
-    assert "\n" not in str(caught.value)
-
-
-def test_impossible_address_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"^port 0 of host '192\.0\.2\.1' cannot be opened"):
-        LivePage("192.0.2.1", 0)  # an address reserved for documentation: no machine has it
-    with pytest.raises(ValueError, match=r"^port is 65536"):
-        LivePage(port=65536)
-
-
 def test_page_follows_and_plays(page: LivePage, recording: Recording, capsys: pytest.CaptureFixture) -> None:
     page.begin(recording.scene, recording.target)
     began = time.monotonic()
@@ -165,20 +141,16 @@ def test_update_needs_a_scene(page: LivePage, recording: Recording) -> None:
         page.update(recording.states[0], None, 0.0)
 
 
-def test_nobody_can_make_the_page_public(page: LivePage) -> None:
-    assert page._server.request_share_url() is None
-
-
 def test_clock_runs_over_and_survives_nonsense(page: LivePage) -> None:
-    panel = Panel(page._server.gui)
+    panel = Panel(page._server.gui, lambda name, client: None, lambda: None)
     panel.play(1.0, 0.01)
     assert panel.advance(0.25) == pytest.approx(0.25)
     assert panel.advance(0.25) == pytest.approx(0.5)
     assert panel.advance(5.0) == 1.0
     assert panel.advance(0.0) == 0.0
-    for value in (np.nan, np.inf, -np.inf, -1.0):
-        assert within(value, 0.5, 2.0) == 0.5
-    assert within(3.0, 0.5, 2.0) == 2.0
+    for value in (np.nan, np.inf, -1.0):
+        panel._time.value = value  # type: ignore[misc]
+        assert panel.advance(0.25) == pytest.approx(0.25)
 
 
 def test_replay_stands_alone(recording: Recording, tmp_path: Path) -> None:

@@ -1,21 +1,27 @@
 """The viewer: draws scenes, states and plans in the browser, in a file and in a picture; knows no task."""
 
-from viewer.app import LivePage, show
+from viewer.app import LivePage, Stopped, show
 from viewer.film import check_film, write_film
 from viewer.picture import kick_picture
 from viewer.recording import Approach, Recording, nearest_approach
-from viewer.replay import framed, write_html
+from viewer.replay import framed, page_of, write_html
 from viewer.scene_view import SceneView
+from viewer.wishes import Offer, Push, Wishes
 
 __all__ = [
     "Approach",
     "LivePage",
+    "Offer",
+    "Push",
     "Recording",
     "SceneView",
+    "Stopped",
+    "Wishes",
     "check_film",
     "framed",
     "kick_picture",
     "nearest_approach",
+    "page_of",
     "show",
     "write_film",
     "write_html",

@@ -1,108 +1,283 @@
-"""The page on which a kick is watched, live while it runs and again afterwards."""
+"""The page on which a kick is planned and watched, live while it runs and again afterwards.
+
+Planning, execution and drawing are apart: whoever plans says what is new and goes on; a thread of the page draws the
+latest of it, 30 times a second at most; what clients send is checked and kept until it is asked for.
+"""
 
 from __future__ import annotations
 
-import io
-import socket
+import queue
 import threading
 import time as clock
-from contextlib import redirect_stdout
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
 from types import TracebackType
+from typing import Literal
 
 import numpy as np
 import viser
 
 from larp_model.scene import Scene
+from larp_model.state import POSITION
+from viewer.camera import VIEWS, View
+from viewer.handles import Handles
 from viewer.panel import Panel
-from viewer.recording import Recording
-from viewer.stage import LEGEND, Stage
+from viewer.recording import Recording, known, nearest_approach
+from viewer.server import address_of, close_server, open_server
+from viewer.stage import LEGEND, Stage, whole
+from viewer.wishes import Offer, Push, Wishes
 
 FRAME = 1.0 / 30.0  # s
+FOLLOWED = (-2.2, -3.2, 1.4)  # m, from the ball to a camera that follows it
+
+Mode = Literal["waiting", "planned", "running", "replay"]
 
 
-class _Server(viser.ViserServer):
-    def request_share_url(self, verbose: bool = True) -> None:
-        """Any browser may ask for a public address; there is none."""
+class Stopped(Exception):
+    """The page was closed, or asked to stop what runs."""
 
 
-def open_server(host: str = "127.0.0.1", port: int = 8080) -> viser.ViserServer:
-    """A silent Viser server on exactly this address; port 0 takes a free one.
+@dataclass
+class News:
+    """What is to be drawn next; None: as it is."""
 
-    Raises ValueError where it cannot be had: Viser itself would move to another port, or try for ever.
-    """
-    if not 0 <= port < 2**16:
-        raise ValueError(f"port is {port!r}, but must be in [0, 65536)")
-    try:
-        socket.create_server((host, port)).close()
-    except OSError as error:
-        raise ValueError(f"port {port} of host {host!r} cannot be opened: {error}; choose another") from None
-    with redirect_stdout(io.StringIO()):
-        server = _Server(host, port, verbose=False)
-    if port and server.get_port() != port:
-        close_server(server)
-        raise ValueError(f"port {port} of host {host!r} was taken meanwhile; choose another")
-    return server
-
-
-def close_server(server: viser.ViserServer) -> None:
-    """Stop a server, silently."""
-    with redirect_stdout(io.StringIO()):
-        server.stop()
+    state: np.ndarray
+    time: float
+    path: list[np.ndarray] = field(default_factory=list)
+    plan: np.ndarray | None = None
+    plan_time: float = 0.0
+    fan: tuple[np.ndarray, np.ndarray] | None = None
+    reference: np.ndarray | None = None
+    fresh: bool = True
 
 
 class LivePage:
     """A page that follows a kick while it runs, and plays its recording once it is over.
 
-    `begin`, `update` and `finish` return at once; a thread draws. Where states come faster than they can be
-    drawn, the latest wins. Leaving the `with` block closes the page.
+    `begin`, `planned`, `update` and `finish` return at once; a thread draws. Where states come faster than they can be
+    drawn, the latest wins. With an offer, people set there what they wish: see `wishes` and `asked`. Leaving the `with`
+    block closes the page.
     """
 
-    def __init__(self, host: str = "127.0.0.1", port: int = 8080) -> None:
+    def __init__(self, host: str = "127.0.0.1", port: int = 8080, offer: Offer | None = None) -> None:
         self._server = open_server(host, port)
-        self.address = f"http://{host}:{self._server.get_port()}"
-        self._panel = Panel(self._server.gui)
-        self._lock = threading.Lock()
-        self._closed = threading.Event()
+        self.address = address_of(self._server)
+        self.offer = offer
+        self._lock, self._closed, self._moved = threading.RLock(), threading.Event(), threading.Event()
+        self._changes = 0
+        self._asked: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._mode: Mode = "waiting"
         self._stage: Stage | None = None
+        self._handles: Handles | None = None
+        self._news: News | None = None
         self._recording: Recording | None = None
-        self._drawn: int | None = None  # row of the recording that is on the page
+        self._beside: Recording | None = None
+        self._drawn: tuple[int, frozenset[str]] | None = None  # row of the recording that is on the page, and ghosts
+        self._single = 0  # steps that may be taken although time stands still
+        self._views: dict[int, tuple[str, float]] = {}  # by client: how it looks, and the aspect that this was for
+        self.files: Callable[[str, Recording], tuple[str, bytes]] | None = None
+        self._panel = Panel(self._server.gui, self._ask, self._change, offer)
+        self._server.on_client_connect(self._welcome)
+        self._server.on_client_disconnect(self._part)
         self._thread = threading.Thread(target=self._draw, daemon=True)
         self._thread.start()
 
-    def begin(self, scene: Scene, target: np.ndarray, traced: int = -1) -> None:
-        """Set the stage. target: (3,) [m]. traced: row in the state of the link whose path is drawn."""
+    # What people do.
+
+    def _change(self) -> None:
+        with self._lock:
+            self._changes += 1
+            if self._stage and self._handles and self._mode != "replay":
+                self._stage.lane.aim(np.array(self._handles.target))
+        self._moved.set()
+
+    def _ask(self, name: str, client: viser.ClientHandle | None) -> None:
+        """Do at once what is the page's own, keep all else for whoever plans."""
+        if name == "step":
+            with self._lock:
+                self._single += 1
+                if self._recording is not None:
+                    self._panel.move(self._recording.scene.dt)
+        elif name == "weights":
+            self._panel.as_at_first()
+            self._change()
+        elif name == "look":
+            with self._lock:
+                self._drawn = None
+                if self._news:
+                    self._news.fresh = True
+        elif name.startswith("view ") and client is not None:
+            self._look(client, name.removeprefix("view "))
+        elif name.startswith("download ") and client is not None:
+            self._download(client, name.removeprefix("download "))
+        elif name != "play":
+            self._asked.put(name)
+        self._moved.set()
+
+    @property
+    def wishes(self) -> Wishes:
+        """What is set now; needs an offer, and `begin` before."""
+        with self._lock:
+            assert self._handles is not None
+            return Wishes(self._handles.target, self._handles.spot, self._handles.roll, **self._panel.asked_for())
+
+    @property
+    def changes(self) -> int:
+        """How often a setting has changed."""
+        return self._changes
+
+    def asked(self, seconds: float = 0.0) -> str | None:
+        """What was asked for next; None where nothing was in so many seconds. Raises `Stopped` once closed."""
+        end = clock.monotonic() + seconds
+        while True:
+            if self._closed.is_set():
+                raise Stopped
+            with suppress(queue.Empty):
+                return self._asked.get_nowait()
+            if (left := end - clock.monotonic()) <= 0.0:
+                return None
+            self._moved.clear()
+            if self._asked.empty():
+                self._moved.wait(left)
+                if self._asked.empty():
+                    return None
+
+    def push(self, name: str) -> Push:
+        """The push that is set, for a body by name."""
+        return Push(name, self._panel.push())
+
+    def hold(self, until: float) -> None:
+        """Wait until the moment `until` of a monotonic clock [s], and for as long as time stands still on the page."""
+        while not self._closed.is_set():
+            if self._panel.playing:
+                left = until - clock.monotonic()
+                if left <= 0.0:
+                    return
+                self._closed.wait(min(left, FRAME))
+            else:
+                with self._lock:
+                    if self._single:
+                        self._single -= 1
+                        return
+                if not self._asked.empty():
+                    return
+                self._closed.wait(FRAME)
+        raise Stopped
+
+    @property
+    def playing(self) -> bool:
+        """Whether time goes on."""
+        return self._panel.playing
+
+    @property
+    def speed(self) -> float:
+        """Of time on the page, as a share of its own."""
+        return self._panel.speed
+
+    # What is shown.
+
+    def begin(self, scene: Scene, target: np.ndarray, traced: int = -1, state: np.ndarray | None = None) -> None:
+        """Set the stage. target: (3,) [m]. traced: row in the state of the link whose path is drawn.
+
+        state: (L, 13), in which it usually begins; needed with an offer.
+        """
         with self._lock:
             self._stage = Stage(self._server, scene, target, traced)
-            self._recording, self._dt = None, scene.dt
-            self._path: list[np.ndarray] = []
-            self._plan: np.ndarray | None = None
-            self._news: tuple[np.ndarray, float] | None = None
+            seen = np.array([(0.0, 0.0, 0.0), (0.0, 0.0, 1.8)]) if state is None else np.asarray(state)[:, POSITION]
+            self._stage.frame(np.concatenate([seen, np.asarray(target, float)[None]]))
+            self._recording, self._beside, self._news, self._scene = None, None, None, scene
+            self._mode, self._single = "waiting", 0
+            if self.offer is not None:
+                assert state is not None
+                before, ball = self._handles, self._stage.lane.position(state)
+                self._handles = Handles(self._server, self.offer, tuple(target), ball, self._change)
+                if before is not None:
+                    self._handles.again(before)
+            if state is not None:
+                self._stage.lane.show(state)
             self._panel.watch()
 
-    def update(self, state: np.ndarray, predicted: np.ndarray | None, time: float) -> None:
+    def planned(
+        self,
+        state: np.ndarray,
+        expected: np.ndarray,
+        fan: tuple[np.ndarray, np.ndarray] | None = None,
+        reference: np.ndarray | None = None,
+    ) -> None:
+        """A plan that waits to be carried out: what it expects (H, L, 13) from a state (L, 13) on.
+
+        fan: other candidates' paths (N, T, 3) [m] of the traced link, and their costs (N,). reference: state (L, 13).
+        """
+        with self._lock:
+            assert self._stage is not None
+            if self._handles:
+                self._stage.lane.aim(np.array(self._handles.target))
+                self._handles.shown(True)
+            self._stage.compare(None)
+            self._recording, self._beside, self._mode = None, None, "planned"
+            self._news = News(np.array(state), 0.0, [], np.array(expected), 0.0, fan, reference)
+            self._panel.watch()
+
+    def update(
+        self, state: np.ndarray, predicted: np.ndarray | None, time: float, reference: np.ndarray | None = None
+    ) -> None:
         """The truth's state (L, 13) at `time` [s].
 
-        predicted: (H, L, 13) of the model for time + dt, time + 2 dt, ..., if just asked; otherwise None.
+        predicted: (H, L, 13) of the model for time + dt, time + 2 dt, ..., if just asked; otherwise None. reference:
+        state (L, 13), if it is to be seen.
         """
         with self._lock:
             if self._stage is None:
                 raise ValueError("update came before begin, but the page needs a scene first")
+            if self._mode != "running":
+                self._mode, self._recording = "running", None
+                self._news = News(np.array(state), time, fan=self._news.fan if self._news else None)
+                if self._handles:
+                    self._handles.shown(False)
+                self._panel.watch()
+            news = self._news
+            assert news is not None
             if predicted is not None:
-                self._plan, self._plan_time = np.array(predicted), time
-            self._path.append(self._stage.position(state).copy())
-            self._news = np.array(state), time
+                news.plan, news.plan_time = np.array(predicted), time
+            news.path.append(self._stage.lane.position(state).copy())
+            news.state, news.time, news.reference, news.fresh = np.array(state), time, reference, True
 
-    def finish(self, recording: Recording) -> None:
-        """Offer the recording for play."""
-        self.begin(recording.scene, recording.target, recording.traced)
+    def finish(self, recording: Recording, beside: Recording | None = None) -> None:
+        """Offer a recording for play, and another beside it."""
         with self._lock:
-            assert self._stage is not None
-            miss = self._stage.trace(recording.path, recording.predicted_path)
-            facts = {"nearest to the target": f"{100.0 * miss:.1f} cm", **recording.summary}
-            lines = (f"- {name}: {text}" for name, text in facts.items())
-            self._panel.write("\n".join([f"**{recording.title or 'Replay'}**", "", *lines, "", LEGEND]))
-            self._panel.play(recording.duration, recording.scene.dt)
-            self._recording, self._drawn = recording, None
+            if self._stage is None or self.offer is None:
+                self.begin(recording.scene, recording.target, recording.traced)
+            stage = self._stage
+            assert stage is not None
+            stage.lane.aim(recording.target)
+            stage.frame(whole(recording))
+            stage.lane.trace(recording.path, recording.predicted_path)
+            stage.lane.fan(None)
+            lane = stage.compare(None if beside is None else beside.target)
+            if lane is not None and beside is not None:
+                lane.trace(beside.path, beside.predicted_path)
+            if self._handles:
+                self._handles.shown(True)
+            both = [recording, *([] if beside is None else [beside])]
+            self._panel.write("\n\n".join([*map(described, both), LEGEND]))
+            self._panel.play(max(each.duration for each in both), recording.scene.dt)
+            self._recording, self._beside, self._drawn, self._news = recording, beside, None, None
+            self._mode = "replay"
+
+    def tell(self, text: str) -> None:
+        """What is going on, in Markdown."""
+        self._panel.write(f"{text}\n\n{LEGEND}")
+
+    @property
+    def panel(self) -> Panel:
+        """The controls beside the picture."""
+        return self._panel
+
+    @property
+    def recording(self) -> Recording | None:
+        """What is being played; None while nothing is."""
+        return self._recording
 
     def wait(self) -> None:
         """Leave the page open until it is closed or the user interrupts."""
@@ -115,6 +290,7 @@ class LivePage:
         """Stop drawing and serving."""
         if not self._closed.is_set():
             self._closed.set()
+            self._moved.set()
             self._thread.join()
             close_server(self._server)
 
@@ -126,6 +302,8 @@ class LivePage:
     ) -> None:
         self.close()
 
+    # Drawing.
+
     def _draw(self) -> None:
         last = clock.monotonic()
         while not self._closed.wait(FRAME):
@@ -133,26 +311,97 @@ class LivePage:
             with self._lock:
                 if self._recording is not None:
                     self._draw_recording(self._recording, now - last)
-                elif self._stage is not None and self._news is not None:
-                    self._draw_news(self._stage, *self._news)
+                elif self._stage is not None and self._news is not None and self._news.fresh:
+                    self._draw_news(self._stage, self._news)
             last = now
 
     def _draw_recording(self, recording: Recording, elapsed: float) -> None:
-        row = min(round(self._panel.advance(elapsed) / recording.scene.dt), len(recording.states) - 1)
-        if row != self._drawn and self._stage is not None:
-            self._stage.show(recording.states[row], recording.predicted_at(row))
-            self._drawn = row
+        stage = self._stage
+        assert stage is not None
+        row = round(self._panel.advance(elapsed) / recording.scene.dt)
+        ghosts = frozenset(self._panel.ghosts)
+        if (row, ghosts) == self._drawn:
+            return
+        for lane, each in ((stage.lane, recording), (stage.beside, self._beside)):
+            if lane is not None and each is not None:
+                own = min(row, len(each.states) - 1)
+                lane.shown = set(ghosts)
+                lane.show(each.states[own], prediction=each.predicted_at(own), reference=each.reference_at(own))
+        self._follow(stage.lane.position(recording.states[min(row, len(recording.states) - 1)]))
+        self._drawn = row, ghosts
 
-    def _draw_news(self, stage: Stage, state: np.ndarray, time: float) -> None:
+    def _draw_news(self, stage: Stage, news: News) -> None:
+        lane, plan = stage.lane, news.plan
+        lane.shown = self._panel.ghosts
         expected = None
-        if self._plan is not None:
-            step = round((time - self._plan_time) / self._dt) - 1
-            expected = self._plan[step] if 0 <= step < len(self._plan) else None
-        stage.show(state, expected)
-        miss = stage.trace(np.array(self._path), None if self._plan is None else stage.position(self._plan))
-        nearest = f"time {time:.2f} s, nearest to the target so far {100.0 * miss:.1f} cm"
-        self._panel.write(f"{nearest}\n\n{LEGEND}")
-        self._news = None
+        if plan is not None:
+            step = round((news.time - news.plan_time) / self._scene.dt) - 1
+            if self._mode == "planned":
+                step = int(clock.monotonic() / self._scene.dt * self._panel.speed) % len(plan)
+            expected = known(plan)[step] if 0 <= step < len(plan) else None
+        lane.show(news.state, prediction=expected, reference=news.reference)
+        path = np.array(news.path) if news.path else None
+        miss = lane.trace(path, None if plan is None else lane.position(plan))
+        if news.fan is not None and "fan" in lane.shown:
+            lane.fan(*news.fan)
+        else:
+            lane.fan(None)
+        self._follow(lane.position(news.state))
+        if self._mode == "running":
+            self._panel.write(f"**Kicking**, {news.time:.2f} s: {100.0 * miss:.1f} cm from the target\n\n{LEGEND}")
+        news.fresh = self._mode == "planned" and self._panel.playing
+
+    # Cameras and files, each client's own.
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        self._look(client, "side")
+
+        # The panel, and whoever changes the window, leave more or less of it to the picture.
+        @client.camera.on_update
+        async def _(camera: viser.CameraHandle) -> None:
+            view, aspect = self._views.get(client.client_id, ("", camera.aspect))
+            if abs(camera.aspect / aspect - 1.0) > 0.02:
+                self._look(client, view)
+
+    def _part(self, client: viser.ClientHandle) -> None:
+        self._views.pop(client.client_id, None)
+
+    def _look(self, client: viser.ClientHandle, view: str) -> None:
+        aspect = float(np.clip(client.camera.aspect, 0.2, 5.0))
+        self._views[client.client_id] = view, aspect
+        chosen: View | None = next((each for each in VIEWS if each == view), None)
+        with self._lock:
+            if self._stage is None or chosen is None:
+                return
+            camera, stage = self._stage.camera(chosen, aspect), self._stage
+        with client.atomic():
+            client.camera.position, client.camera.look_at = camera.place, stage.middle(camera)
+
+    def _follow(self, ball: np.ndarray) -> None:
+        for number, client in self._server.get_clients().items():
+            if self._views.get(number, ("",))[0] == "follow":
+                with client.atomic():
+                    client.camera.position, client.camera.look_at = ball + FOLLOWED, ball
+
+    def _download(self, client: viser.ClientHandle, kind: str) -> None:
+        """Make a file of the recording that is played, apart from what is drawn, and hand it to one client."""
+        recording, files = self._recording, self.files
+        if recording is None or files is None:
+            client.add_notification("Nothing to download yet", "Kick first.", auto_close_seconds=4.0)
+            return
+
+        def make() -> None:
+            client.send_file_download(*files(kind, recording), save_immediately=True)
+
+        threading.Thread(target=make, daemon=True).start()
+
+
+def described(recording: Recording) -> str:
+    """A recording in Markdown."""
+    miss = nearest_approach(recording.path, recording.target).distance
+    facts = {"nearest to the target": f"{100.0 * miss:.1f} cm", **recording.summary}
+    lines = (f"- {name}: {text}" for name, text in facts.items())
+    return "\n".join([f"**{recording.title or 'Replay'}**", "", *lines])
 
 
 def show(recording: Recording, host: str = "127.0.0.1", port: int = 8080) -> None:

@@ -6,7 +6,7 @@ import subprocess
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import imageio.v3 as imageio
 import numpy as np
@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from larp_model.files import write_whole
 from larp_model.state import ORIENTATION, POSITION
+from viewer.camera import Camera, around
 from viewer.recording import Approach, Recording, nearest_approach
 from viewer.scene_view import BALL_PATCHES, PREDICTION, TARGET, TRUTH, Colour, football_meshes, link_colour
 
@@ -28,10 +29,6 @@ SUFFIXES = (".mp4", ".gif")
 SLOW = 0.25  # of its speed, up to the target
 LINGER = 0.1  # s for which it stays slow beyond
 DOTS = 100  # per inch
-# The camera looks from the right-hand side, a little from behind and above.
-AZIMUTH, ELEVATION = np.radians(65.0), np.radians(12.0)
-TANGENT = 0.32  # of half the angle of view, across
-MARGIN = 0.4  # m around what must be seen
 NEAR, FAR = 0.5, 20.0  # m, between which the ground is drawn
 LIGHT = np.array([0.25, -0.45, -1.0])  # the way it falls
 SKY, GROUND, LINES, SHADOW, INK, QUIET = "#ffffff", "#f3f5f7", "#d5dae0", "#dde1e6", "#22262c", "#5b6470"
@@ -104,45 +101,6 @@ def frames(recording: Recording, size: tuple[int, int] = (1280, 720), rate: floa
             yield picture
 
 
-class Camera(NamedTuple):
-    """A pinhole. place: (3,) [m]. axes: (3, 3), its right, up and forwards in rows."""
-
-    place: np.ndarray
-    axes: np.ndarray
-
-    @classmethod
-    def of(cls, points: np.ndarray, aspect: float) -> Camera:
-        """The nearest one, looking the usual way, that has all of (P, 3) [m] in a picture of height `aspect`."""
-        forwards = np.array([np.cos(AZIMUTH), np.sin(AZIMUTH), -np.tan(ELEVATION)])
-        forwards /= np.linalg.norm(forwards)
-        right = np.cross(forwards, (0.0, 0.0, 1.0))
-        right /= np.linalg.norm(right)
-        axes = np.stack([right, np.cross(right, forwards), forwards])
-        x, y, depth = (points @ axes.T).T
-        place = np.zeros(3)
-        back = np.inf
-        # A point is in the picture where |x - place| <= tangent (depth - back): two bounds on each side.
-        for axis, (across, tangent) in enumerate(((x, TANGENT), (y, TANGENT * aspect))):
-            high, low = (across - tangent * depth).max(), (-across - tangent * depth).max()
-            place[axis] = 0.5 * (high - low)
-            back = min(back, -0.5 * (high + low) / tangent)
-        place[2] = back
-        return cls(place @ axes, axes)
-
-    def depth(self, points: np.ndarray) -> np.ndarray:
-        """How far ahead points (*, 3) are [m]."""
-        return np.asarray((points - self.place) @ self.axes[2])
-
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Where points (*, 3) [m] are in the picture, (*, 2), its width from -1 to 1."""
-        seen = (points - self.place) @ self.axes.T
-        return np.asarray(seen[..., :2] / (TANGENT * seen[..., 2:]))
-
-    def sphere(self, centre: np.ndarray, radius: float) -> tuple[np.ndarray, float]:
-        """Middle (2,) and radius of a sphere in the picture; that it is an ellipse there is not seen."""
-        return self(centre), radius / (TANGENT * float(self.depth(centre)))
-
-
 def _times(recording: Recording, approach: Approach, rate: float) -> Iterator[float]:
     """The moments [s] of the film's pictures."""
     slow = min(approach.row * recording.scene.dt + LINGER, recording.duration)
@@ -155,9 +113,7 @@ def _seen(recording: Recording, approach: Approach) -> np.ndarray:
     ball = recording.traced % len(recording.scene.links)
     links = np.delete(recording.states[::5], ball, axis=1)[..., POSITION].reshape(-1, 3)
     way = recording.path[: approach.row + 2]
-    points = np.concatenate([links, way, np.asarray(recording.target, float)[None]])
-    corners = MARGIN * np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    return (points[:, None] + corners).reshape(-1, 3)
+    return around(links, way, np.asarray(recording.target, float))
 
 
 def _ground(axes: Axes, camera: Camera) -> None:

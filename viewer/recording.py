@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +29,16 @@ def nearest_approach(path: np.ndarray, target: np.ndarray) -> Approach:
         raise ValueError(f"path has shape {path.shape}, but needs (T, 3) with at least one point")
     point, row = nearest_on_path(np.append(path, path[-1:], axis=0), target)
     return Approach(float(np.linalg.norm(point - target)), point, int(row))
+
+
+def known(predicted: np.ndarray, traced: int = -1) -> np.ndarray:
+    """Predicted states (T, L, 13), NaN where all links but the traced only repeat the last that was worked out."""
+    found = np.array(predicted, float)
+    others = np.arange(found.shape[1]) != traced % found.shape[1]
+    moves = (found[1:, others] != found[:-1, others]).any(axis=(1, 2))
+    last = int(moves.nonzero()[0][-1]) + 1 if moves.any() else len(found) - 1
+    found[last + 1 :, others] = np.nan
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,12 +102,16 @@ class Recording:
         """Radius of the traced link [m]."""
         return self.scene.links[self.traced].radius
 
+    @cached_property
+    def _known(self) -> np.ndarray | None:
+        return None if self.predicted is None else known(self.predicted, self.traced)
+
     def predicted_at(self, row: int) -> np.ndarray | None:
-        """The state (L, 13) that the model expected at a row of the truth; None where it expected nothing."""
+        """The state (L, 13) that the model expected at a row of the truth, NaN where it looked no further; or None."""
         index = row - self.predicted_start
-        if self.predicted is None or not 0 <= index < len(self.predicted):
+        if self._known is None or not 0 <= index < len(self._known):
             return None
-        return np.asarray(self.predicted[index])
+        return np.asarray(self._known[index])
 
     def reference_at(self, row: int) -> np.ndarray | None:
         """The reference's state (L, 13) at a row of the truth; None beyond its end."""

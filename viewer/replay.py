@@ -6,9 +6,9 @@ from html import escape
 from pathlib import Path
 
 from larp_model.files import write_whole
-from viewer.app import close_server, open_server
 from viewer.recording import Recording
-from viewer.stage import LEGEND, Stage
+from viewer.server import close_server, open_server
+from viewer.stage import LEGEND, Stage, whole
 
 FRAME = 0.02  # s of recorded time between two pictures
 
@@ -31,11 +31,14 @@ def page_of(recording: Recording) -> str:
     server = open_server(port=0)
     try:
         stage = Stage(server, recording.scene, recording.target, recording.traced)
-        miss = stage.trace(recording.path, recording.predicted_path)
+        stage.frame(whole(recording))
+        miss = stage.lane.trace(recording.path, recording.predicted_path)
         film = server.get_scene_serializer()
         stride = max(1, round(FRAME / recording.scene.dt))
         for row in range(0, len(recording.states), stride):
-            stage.show(recording.states[row], recording.predicted_at(row))
+            stage.lane.show(
+                recording.states[row], prediction=recording.predicted_at(row), reference=recording.reference_at(row)
+            )
             film.insert_sleep(stride * recording.scene.dt)
         page = film.as_html()
     finally:

@@ -19,7 +19,8 @@ Mesh = tuple[np.ndarray, np.ndarray]  # vertices (V, 3) [m], faces (F, 3)
 
 TRUNK, LEFT, RIGHT = (92, 107, 133), (112, 178, 217), (233, 160, 60)
 BALL_PATCHES = ((246, 246, 243), (38, 40, 46))  # hexagons, pentagons
-TRUTH, PREDICTION, TARGET = (213, 94, 0), (0, 114, 178), (0, 158, 115)  # Okabe and Ito's, safe for all eyes
+# Okabe and Ito's, safe for all eyes.
+TRUTH, PREDICTION, TARGET, REFERENCE = (213, 94, 0), (0, 114, 178), (0, 158, 115), (110, 116, 126)
 
 
 def link_colour(link: Link) -> Colour:
@@ -104,11 +105,13 @@ class SceneView:
                     )
 
     def update(self, state: np.ndarray | None) -> None:
-        """Move the links to a state (L, 13); hide them all if it is None."""
+        """Move the links to a state (L, 13); hide those whose state is not known (NaN), or all if it is None."""
         if state is not None and np.shape(state) != (len(self._links), SIZE):
             raise ValueError(f"state has shape {np.shape(state)}, but needs ({len(self._links)}, {SIZE})")
         with self._server.atomic():
             self._root.visible = state is not None
             if state is not None:
                 for link, row in zip(self._links, np.asarray(state, float), strict=True):
-                    link.position, link.wxyz = row[POSITION], row[ORIENTATION]
+                    link.visible = bool(np.isfinite(row).all())
+                    if link.visible:
+                        link.position, link.wxyz = row[POSITION], row[ORIENTATION]

@@ -1,81 +1,198 @@
-"""What stands around a scene: ground, light and camera; the target, both paths, and how far they miss it."""
+"""What stands around a scene: pitch, light and goal; and lanes, in each of which a kick is drawn."""
 
 from __future__ import annotations
 
 import numpy as np
 import viser
+from matplotlib import colormaps
 
 from larp_model.scene import Scene
 from larp_model.state import POSITION
-from viewer.recording import nearest_approach
-from viewer.scene_view import PREDICTION, TARGET, TRUTH, Colour, SceneView
+from viewer.camera import Camera, View, around
+from viewer.recording import Recording, nearest_approach
+from viewer.scene_view import PREDICTION, REFERENCE, TARGET, TRUTH, Colour, SceneView
 
 LEGEND = "orange: truth, blue: prediction, green: target"
-GROUND, LINES = (238, 240, 242), (196, 202, 209)
+GROUND, LINES, POSTS = (233, 238, 234), (190, 202, 194), (250, 250, 250)
+GOAL = (6.0, 3.0, 2.0)  # m: how far ahead it stands, how wide and how high it is; for scale alone
+FIELD_OF_VIEW = 0.7  # rad, from top to bottom
+FAR = 6  # m, up to which the ground is numbered
+# Candidates' paths are drawn from cheap to dear in these shares of the colour map.
+FAN, CHEAP, DEAR = "viridis_r", 0.05, 0.95
 
 
-class Stage:
-    """Draws the truth and, as a ghost, what the model expected of it."""
+class Lane:
+    """One kick: what happened, and as ghosts what the model and the reference say; both paths, target and miss."""
 
-    def __init__(self, server: viser.ViserServer, scene: Scene, target: np.ndarray, traced: int = -1) -> None:
-        """target: (3,) [m]. traced: row in the state of the link whose path is drawn."""
-        self._server, self._target, self._traced = server, np.asarray(target, float), traced
-        with server.atomic():
-            server.scene.reset()
-            server.scene.set_up_direction("+z")
-            server.scene.configure_environment_map("studio", environment_intensity=0.6)
-            server.scene.add_grid(
-                "/ground",
-                60.0,
-                60.0,
-                cell_size=0.5,
-                section_size=1.0,
-                section_thickness=1.5,
-                cell_color=LINES,
-                section_color=LINES,
-                plane_color=GROUND,
-                plane_opacity=1.0,
-                shadow_opacity=0.25,
-                fade_distance=30.0,
-            )
-            radius = scene.links[traced].radius
-            server.scene.add_icosphere(
-                "/target", radius, TARGET, opacity=0.45, cast_shadow=False, position=self._target
-            )
-            top = self._target + np.array([0.0, 0.0, radius])
-            self._label = server.scene.add_label("/nearest", "", position=top, anchor="bottom-center", visible=False)
-            self._truth = SceneView(server, scene, "/truth")
-            self._ghost = SceneView(server, scene, "/prediction", PREDICTION, opacity=0.4)
-            self._ghost.update(None)
-            reach = max(2.0, float(np.linalg.norm(self._target[:2])))
-            server.initial_camera.fov = 0.7
-            server.initial_camera.position = 0.5 * self._target + reach * np.array([-0.35, -1.1, 0.4])
-            server.initial_camera.look_at = 0.5 * self._target + np.array([0.0, 0.0, 0.25])
+    def __init__(
+        self, server: viser.ViserServer, scene: Scene, name: str, target: np.ndarray, traced: int, aside: float = 0.0
+    ) -> None:
+        """name: in Viser's tree. target: (3,) [m]. traced: row of the link whose path is drawn. aside: along y [m]."""
+        self._server, self._name, self._traced = server, name, traced
+        self._radius = scene.links[traced].radius
+        self._root = server.scene.add_frame(name, show_axes=False, position=(0.0, aside, 0.0))
+        self._ball = server.scene.add_icosphere(
+            f"{name}/target", self._radius, TARGET, opacity=0.45, cast_shadow=False, receive_shadow=False
+        )
+        self._label = server.scene.add_label(f"{name}/nearest", "", anchor="bottom-center", visible=False)
+        self._truth = SceneView(server, scene, f"{name}/truth")
+        self._ghosts = {
+            "prediction": SceneView(server, scene, f"{name}/prediction", PREDICTION, opacity=0.35),
+            "reference": SceneView(server, scene, f"{name}/reference", REFERENCE, opacity=0.18),
+        }
+        for ghost in self._ghosts.values():
+            ghost.update(None)
+        self.shown = set(self._ghosts)
+        self.aim(target)
 
-    def show(self, state: np.ndarray, expected: np.ndarray | None = None) -> None:
-        """Move the truth to `state` (L, 13) and the ghost to `expected` (L, 13), or hide it."""
+    def aim(self, target: np.ndarray) -> None:
+        """Move the target (3,) [m]."""
+        self.target = np.asarray(target, float)
+        self._ball.position = self.target
+        self._label.position = self.target + np.array([0.0, 0.0, self._radius])
+
+    def show(self, state: np.ndarray, **ghosts: np.ndarray | None) -> None:
+        """Move the truth to a state (L, 13) and each ghost to its own, or hide it; the reference kicks no ball."""
+        if (reference := ghosts.get("reference")) is not None:
+            ghosts["reference"] = alone = np.array(reference)
+            alone[self._traced] = np.nan
         with self._server.atomic():
             self._truth.update(state)
-            self._ghost.update(expected)
+            for name, ghost in self._ghosts.items():
+                ghost.update(ghosts.get(name) if name in self.shown else None)
 
-    def trace(self, path: np.ndarray, expected: np.ndarray | None = None) -> float:
-        """Draw the paths (T, 3) of the truth and (T', 3) of the prediction [m].
+    def trace(self, path: np.ndarray | None, expected: np.ndarray | None = None) -> float:
+        """Draw the paths (T, 3) of the truth and (T', 3) of the prediction [m]; None: there is none.
 
-        Returns how near the true one comes to the target [m], which the target's label says in cm.
+        Returns how near the true one comes to the target [m], or, as long as it still comes nearer, the expected one; a
+        label at the target says it in cm.
         """
-        approach = nearest_approach(path, self._target)
         with self._server.atomic():
-            self._line("/path/truth", path, TRUTH, 0.02)
-            self._line("/path/nearest", np.stack([approach.point, self._target]), TARGET, 0.01)
-            if expected is not None:
-                self._line("/path/prediction", expected, PREDICTION, 0.02)
-            self._label.text, self._label.visible = f"{100.0 * approach.distance:.1f} cm", True
+            self._line("truth", path, TRUTH, 0.025)
+            self._line("expected", expected, PREDICTION, 0.015)
+            ways = {kind: way for kind, way in (("", path), (" expected", expected)) if way is not None}
+            found = {kind: nearest_approach(way, self.target) for kind, way in ways.items()}
+            if not found:
+                self._label.visible = False
+                return float("inf")
+            if len(found) > 1 and found[""].row >= len(ways[""]) - 2:
+                del found[""]  # it is still on its way
+            kind, approach = next(iter(found.items()))
+            self._line("miss", np.stack([approach.point, self.target]), TARGET, 0.012)
+            self._label.text, self._label.visible = f"{100.0 * approach.distance:.1f} cm{kind}", True
         return approach.distance
+
+    def fan(self, paths: np.ndarray | None, costs: np.ndarray | None = None) -> None:
+        """Draw candidates' paths (N, T, 3) [m], coloured by their costs (N,); without those that are not finite."""
+        if paths is None or costs is None or not (sound := np.isfinite(costs)).any():
+            self._line("fan", None, TRUTH, 0.006)
+            return
+        paths, costs = paths[sound], costs[sound]
+        rank = np.argsort(np.argsort(costs)) / max(1, len(costs) - 1)
+        colours = (255.0 * colormaps[FAN](CHEAP + (DEAR - CHEAP) * rank)[:, :3]).astype(np.uint8)
+        segments = np.stack([paths[:, :-1], paths[:, 1:]], axis=2).reshape(-1, 2, 3)
+        repeated = np.broadcast_to(colours[:, None, None], (len(paths), paths.shape[1] - 1, 2, 3)).reshape(-1, 2, 3)
+        self._server.scene.add_line_segments(
+            f"{self._name}/path/fan", segments.astype(np.float32), repeated, thickness=0.006
+        )
 
     def position(self, state: np.ndarray) -> np.ndarray:
         """(*, 3) [m] of the traced link in states (*, L, 13)."""
         return np.asarray(state)[..., self._traced, POSITION]
 
-    def _line(self, name: str, points: np.ndarray, colour: Colour, thickness: float) -> None:
+    def remove(self) -> None:
+        """Take all of it from the stage."""
+        self._root.remove()
+
+    def _line(self, name: str, points: np.ndarray | None, colour: Colour, thickness: float) -> None:
+        place = f"{self._name}/path/{name}"
+        if points is None or len(points) == 0:
+            self._server.scene.remove_by_name(place)
+            return
         segments = np.stack([points, np.roll(points, -1, axis=0)], axis=1)[: max(1, len(points) - 1)]
-        self._server.scene.add_line_segments(name, segments.astype(np.float32), colour, thickness=thickness)
+        self._server.scene.add_line_segments(place, segments.astype(np.float32), colour, thickness=thickness)
+
+
+class Stage:
+    """The pitch, and on it one kick, or two side by side."""
+
+    def __init__(self, server: viser.ViserServer, scene: Scene, target: np.ndarray, traced: int = -1) -> None:
+        """target: (3,) [m]. traced: row in the state of the link whose path is drawn."""
+        self._server, self._scene, self._traced = server, scene, traced
+        with server.atomic():
+            server.scene.reset()
+            server.scene.set_up_direction("+z")
+            server.scene.configure_environment_map("studio", environment_intensity=0.6)
+            _pitch(server)
+            self.lane = Lane(server, scene, "/kick", target, traced)
+        self.beside: Lane | None = None
+
+    def compare(self, target: np.ndarray | None, aside: float = -2.5) -> Lane | None:
+        """A second lane, so far along y [m] from the first, for another kick; None takes it away."""
+        if self.beside is not None:
+            self.beside.remove()
+            self.beside = None
+        if target is not None:
+            with self._server.atomic():
+                self.beside = Lane(self._server, self._scene, "/beside", target, self._traced, aside)
+        return self.beside
+
+    def frame(self, points: np.ndarray) -> None:
+        """Have all of (P, 3) [m] in the picture of whoever opens the page, or asks for the view as at first."""
+        self._seen = around(points)
+        camera = self.camera("side", 1.6)
+        first = self._server.initial_camera
+        first.fov, first.position, first.look_at = FIELD_OF_VIEW, camera.place, self.middle(camera)
+
+    def camera(self, view: View, aspect: float) -> Camera:
+        """The camera that has in its picture, of width over height `aspect`, what `frame` said."""
+        return Camera.of(self._seen, 1.0 / aspect, view, float(np.tan(0.5 * FIELD_OF_VIEW)) * aspect)
+
+    def middle(self, camera: Camera) -> np.ndarray:
+        """The point (3,) [m] amid all that is seen on which a camera turns."""
+        depth = float(camera.depth(self._seen).mean())
+        return np.asarray(camera.place + depth * camera.axes[2])
+
+
+def whole(recording: Recording) -> np.ndarray:
+    """Points (P, 3) [m] of a recording that must be seen: the human up to the strike, the ball up to its target."""
+    approach = nearest_approach(recording.path, recording.target)
+    target = np.asarray(recording.target, float)
+    return np.concatenate([recording.states[0, :, POSITION], recording.path[: approach.row + 2], target[None]])
+
+
+def _pitch(server: viser.ViserServer) -> None:
+    """The ground with a grid of metres and their numbers, and a goal."""
+    server.scene.add_grid(
+        "/ground",
+        60.0,
+        60.0,
+        cell_size=1.0,
+        section_size=5.0,
+        section_thickness=1.5,
+        cell_color=LINES,
+        section_color=LINES,
+        plane_color=GROUND,
+        plane_opacity=1.0,
+        shadow_opacity=0.3,
+        fade_distance=30.0,
+    )
+    for metre in range(1, FAR + 1):
+        server.scene.add_label(
+            f"/ground/{metre}",
+            f"{metre} m",
+            position=(float(metre), -2.0, 0.0),
+            font_screen_scale=0.7,
+        )
+    ahead, width, height = GOAL
+    for name, size, place in (
+        ("left", (0.08, 0.08, height), (ahead, 0.5 * width, 0.5 * height)),
+        ("right", (0.08, 0.08, height), (ahead, -0.5 * width, 0.5 * height)),
+        ("bar", (0.08, width + 0.08, 0.08), (ahead, 0.0, height)),
+    ):
+        server.scene.add_box(f"/goal/{name}", POSTS, size, position=place)
+    across = np.linspace(-0.5, 0.5, 13) * width
+    down = [(ahead + 0.8 * share, height * (1.0 - share)) for share in np.linspace(0.0, 1.0, 9)]
+    net = [((ahead, y, height), (ahead + 0.8, y, 0.0)) for y in across]
+    net += [((x, across[0], z), (x, across[-1], z)) for x, z in down]
+    server.scene.add_line_segments("/goal/net", np.array(net, np.float32), LINES, thickness=0.01)

@@ -6,7 +6,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import jax
 import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
@@ -16,12 +15,11 @@ from larp_model.truth.mujoco import FINE_SUBSTEPS
 from tasks.benchmarks import report
 from tasks.command import remember_compilations, run
 from tasks.data import random_roll, random_task
-from tasks.kick import Kick
+from tasks.kick import USUAL, Kick
 from tasks.models import DynamicsName, Models, models_of
 from tasks.motions.people import random_people
-from tasks.presets import Preset, PresetName, Seconds, preset_of, within
+from tasks.presets import PresetName, preset_of
 from tasks.sensing import noisy
-from tasks.standing import Standing
 from tasks.task import HEIGHT, Planners
 
 WITHIN = (0.1, 0.25, 0.5)
@@ -55,22 +53,6 @@ def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "compile_seconds": float(sum(row["compile_seconds"] for row in rows)),
         "truth_rollouts": int(sum(row["truth_rollouts"] for row in rows)),
     }
-
-
-def seconds_of(kick: Kick, models: Models, preset: Preset) -> Seconds:
-    """What the preset's plans take, whole windows of them."""
-    planners = kick.planners_of(preset, models)
-    took = []
-    for planner, window, links in (
-        (planners.first, kick.window(np.array([4.0, 0.0, 0.5])), slice(None)),
-        (planners.again, kick.window(np.array([4.0, 0.0, 0.5])), slice(None)),
-        (planners.stand, Standing(kick.scene, kick.reference).window, kick.human),
-    ):
-        plan, (controls, context, steps) = planner.init(jax.random.key(0)), window(0)
-        state = kick.start()[links]
-        runs = [planner.step(plan, state, controls, context, steps=steps)[1].seconds for _ in range(2)]
-        took.append(min(runs))
-    return Seconds(*took)
 
 
 def picture(rows: list[dict[str, Any]], title: str) -> Figure:
@@ -160,7 +142,7 @@ def main(
 
     def planned(kick: Kick) -> tuple[Kick, Models, Planners]:
         models = models_of(kick.scene, dynamics, weights or kick.weights)
-        fitting = chosen if budget is None else within(chosen, budget, partial(seconds_of, kick, models))
+        fitting = chosen if budget is None else kick.within(chosen, budget, models, USUAL)
         return kick, models, kick.planners_of(fitting, models)
 
     usual = Kick.standard(reference, height, body=body, self_contact=self_contact, substeps=substeps)

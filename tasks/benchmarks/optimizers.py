@@ -10,12 +10,11 @@ from rich.table import Table
 from larp_model import weights as stored
 from mpc import CEM, MPPI, GaussNewton, Gradient
 from tasks.benchmarks import report
-from tasks.benchmarks.kick import seconds_of
 from tasks.benchmarks.tradeoff import Point, measure
 from tasks.command import remember_compilations, run
-from tasks.kick import Kick
+from tasks.kick import USUAL, Kick
 from tasks.models import WEIGHTS, models_of
-from tasks.presets import Preset, Stage, within
+from tasks.presets import Preset, Stage
 
 SAMPLING, SOME = CEM(samples=64, rounds=16, elites=12, decay=1.0), CEM(samples=32, rounds=4, elites=8, decay=1.0)
 FORWARD = GaussNewton(rounds=12, jacobian="forward")
@@ -34,7 +33,7 @@ def compare(kick: Kick, name: str, weights: Path, seconds: float, targets: int, 
     """A way to search, its first plan fitted into `seconds` and each replan into a fifth of them."""
     first, again = WAYS[name]
     models = models_of(kick.scene, "larp", weights)
-    preset = within(Preset(first, again, every=5), seconds, partial(seconds_of, kick, models))
+    preset = kick.within(Preset(first, again, every=5), seconds, models, USUAL)
     return measure(kick, Point(preset), weights, targets, seed) | {"way": name}
 
 

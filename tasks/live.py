@@ -1,0 +1,343 @@
+"""A task on its page: what is set there is planned at once, carried out when it is asked for, and kept if it is.
+
+Whoever plans never waits for who looks: the page draws by itself, and is asked what is set before each plan.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from larp_model import state as packed
+from larp_model import weights as stored
+from larp_model.scene import Scene
+from larp_model.truth.mujoco import Truth
+from mpc.loop import Execution, Replan, Window
+from tasks.models import DynamicsName
+from tasks.presets import Preset
+from tasks.task import REACHABLE, Planners, Run, Task
+from viewer import (
+    LivePage,
+    Offer,
+    Push,
+    Recording,
+    Stopped,
+    Wishes,
+    kick_picture,
+    nearest_approach,
+    page_of,
+    write_film,
+)
+
+# What may be asked for: targets [m], the ball's spot from its usual one [m], how it rolls [m/s].
+TARGETS = ((1.5, -2.5, 0.11), (6.0, 2.5, 1.5))
+SPOTS = ((-0.06, -0.06), (0.06, 0.06))
+ROLLS = ((-2.0, -2.0), (1.0, 2.0))
+# Kicks whose errors are shown.
+REMEMBERED = 30
+FILM = (960, 540)
+
+
+class Choices(NamedTuple):
+    """What people may choose from, by name, the usual one first. tasks: one for each reference, made when needed."""
+
+    tasks: Mapping[str, Callable[[], Task]]
+    presets: Mapping[str, Preset]
+    dynamics: tuple[DynamicsName, ...]
+    weights: Mapping[str, Path]
+
+    def offer(self, task: Task) -> Offer:
+        """What the page says of them."""
+        terms = tuple((term.name, term.weight) for term in task.terms)
+        names = tuple(self.presets), self.dynamics, tuple(self.weights), tuple(self.tasks)
+        return Offer(*names, terms, TARGETS, SPOTS, ROLLS)
+
+
+def weights_for(task: Task, chosen: Path | None) -> dict[str, Path]:
+    """The weights that this task's scene takes, by name, those chosen, or the usual ones, first."""
+    known: dict[str, Path] = {}
+    for path in (chosen or task.weights, *sorted(stored.SHIPPED.glob("*.json"))):
+        try:
+            stored.load(path, task.scene)
+        except ValueError:
+            continue
+        known.setdefault(path.stem, path)
+    return known
+
+
+class Pushed:
+    """The truth, in which bodies can be pushed between two steps."""
+
+    def __init__(self, scene: Scene, substeps: int) -> None:
+        self._truth = Truth(scene, 1, substeps, threads=1)
+        self._scene, self.waiting = scene, list[Push]()
+
+    def reset(self, states: np.ndarray) -> None:
+        """See `mpc.loop.World`."""
+        self._truth.reset(states)
+
+    def step(self, control: np.ndarray) -> np.ndarray:
+        """See `mpc.loop.World`: first, all waiting pushes change the velocities of their bodies."""
+        if self.waiting:
+            states = self._truth.state()
+            while self.waiting:
+                push = self.waiting.pop()
+                states[:, self._scene.rows(push.body), packed.VELOCITY] += push.change
+            self._truth.reset(states)
+        return self._truth.step(control)
+
+
+class Live:
+    """Serves one page until it is closed."""
+
+    def __init__(
+        self,
+        page: LivePage,
+        choices: Choices,
+        target: np.ndarray,
+        folder: Path,
+        seed: int = 0,
+        start: Callable[[Task, Wishes], np.ndarray] = lambda task, wishes: task.start(),
+        finished: Callable[[Run], None] = lambda run: None,
+    ) -> None:
+        """target: (3,) [m], at first. folder: where kicks are kept. start: the state (L, 13) that is wished for.
+
+        finished: called with the first run.
+        """
+        self.page, self.choices, self.folder, self.seed = page, choices, folder, seed
+        self._start, self._finished = start, finished
+        self._tasks: dict[str, Task] = {}
+        self._fitted: dict[tuple[str, str, str, str, float], Planners] = {}
+        self.errors: deque[tuple[float, float]] = deque(maxlen=REMEMBERED)
+        self.run: Run | None = None
+        self.planned_for: Wishes | None = None
+        self.plans = 0
+        self.kept: dict[str, Path] = {}
+        task = self.task(next(iter(choices.tasks)))
+        page.files = self.file
+        page.begin(task.scene, target, state=task.start())
+        self._find()
+
+    def task(self, reference: str) -> Task:
+        """The task near a reference, by its name."""
+        if reference not in self._tasks:
+            self._tasks[reference] = self.choices.tasks[reference]()
+        return self._tasks[reference]
+
+    def planners(self, wishes: Wishes) -> Planners:
+        """The planners that are wished for."""
+        key = self._key(wishes)
+        if key not in self._fitted:
+            task, preset = self.task(wishes.reference), self.choices.presets[wishes.preset]
+            dynamics = next(each for each in self.choices.dynamics if each == wishes.dynamics)
+            models = task.models(dynamics, self.choices.weights[wishes.weights])
+            if wishes.budget:
+                preset = task.within(preset, wishes.budget, models, wishes.target)
+            self._fitted[key] = task.planners_of(preset, models)
+        return self._fitted[key]
+
+    @staticmethod
+    def _key(wishes: Wishes) -> tuple[str, str, str, str, float]:
+        return wishes.reference, wishes.preset, wishes.dynamics, wishes.weights, wishes.budget
+
+    def serve(self, first: str | None = None) -> None:
+        """Plan and kick as asked, until the page is closed. first: what to do without being asked."""
+        seen, ask = -1, first
+        try:
+            while True:
+                if ask == "kick":
+                    seen = self.page.changes
+                    self.carry_out()
+                elif ask in ("keep", "open", "beside", "alone"):
+                    self._replays(ask)
+                elif ask == "reset" or seen != self.page.changes:
+                    seen = self.page.changes
+                    self.plan()
+                ask = self.page.asked(1.0 if seen == self.page.changes else 0.0)
+        except (Stopped, KeyboardInterrupt):
+            self.page.close()
+
+    def plan(self) -> None:
+        """Plan for what is set, and show what comes of it."""
+        wishes = self.page.wishes
+        task = self.task(wishes.reference)
+        if not self._ready(wishes):
+            return
+        planner, wanted, state = self.planners(wishes).first, self._window(task)(0), self._start(task, wishes)
+        told = wanted.controls, wanted.context, wanted.weights
+        plan, info = planner.step(planner.init(jax.random.key(self.seed)), state, *told, steps=wanted.steps)
+        costs, states = planner.fan(plan, state, *told, steps=wanted.steps)
+        fan = states[:, :, task.ball, packed.POSITION], costs
+        self.page.planned(state, info.states, fan, task.reference.states[0])
+        self.planned_for, self.plans = wishes, self.plans + 1
+        expected = nearest_approach(
+            info.states[:, task.ball, packed.POSITION], task.place(task.asked(wishes.target))
+        ).distance
+        reach = "" if expected <= REACHABLE else " **Out of reach:** this plan comes nearest."
+        self.page.tell(
+            f"**Ready.** The model expects to miss by {100.0 * expected:.1f} cm, "
+            f"planned in {info.seconds:.2f} s.{reach}"
+        )
+
+    def carry_out(self) -> None:
+        """Plan and kick in the truth, with the target and the weights of each moment; then play it."""
+        wishes = self.page.wishes
+        task = self.task(wishes.reference)
+        if not self._ready(wishes):
+            return
+        world, begun = Pushed(task.scene, task.substeps), time.monotonic()
+        planners, window, shown = self.planners(wishes), self._window(task), list[Replan]()
+
+        def observe(execution: Execution) -> None:
+            nonlocal begun
+            step = len(execution.states) - 1
+            last = task.plans(execution)[-1]
+            news = last.info.states[1:] if last.step == step - 1 else None
+            reference = task.reference.states
+            self.page.update(execution.states[-1], news, step * task.scene.dt, reference[min(step, len(reference) - 1)])
+            if news is not None:
+                shown.append(last)
+                self._told(shown, wishes)
+            while (ask := self.page.asked()) is not None:
+                if ask.startswith("push "):
+                    body = task.scene.bodies[-1 if ask.endswith("ball") else 0].name
+                    world.waiting.append(self.page.push(body))
+                elif ask in ("reset", "kick"):
+                    raise Interrupted
+            begun = max(begun + task.scene.dt / self.page.speed, time.monotonic() - task.scene.dt)
+            self.page.hold(begun)
+
+        try:
+            execution = task.run(
+                planners,
+                wishes.target,
+                self.seed,
+                self._start(task, wishes),
+                observe=observe,
+                world=world,
+                window=window,
+            )
+        except Interrupted:
+            self.plan()
+            return
+        goal = task.asked(self.page.wishes.target)
+        said = {name: getattr(wishes, name) for name in ("preset", "dynamics", "weights")} | {"seed": self.seed}
+        self.run = Run(task, execution, goal, task.report(execution, goal) | said)
+        self.errors.append((self.run.truth_error_m, self.run.model_error_m))
+        self._told(shown, wishes)
+        self.page.finish(self.run.recording)
+        if len(self.errors) == 1:
+            self._finished(self.run)
+
+    def file(self, kind: str, recording: Recording) -> tuple[str, bytes]:
+        """A recording as a file of some kind: its name and content."""
+        if kind == "html":
+            return "kick.html", page_of(recording).encode()
+        path = self.folder / f".download.{kind}"
+        if kind == "png":
+            kick_picture(recording, self.run.costs if self.run else None, path)
+        else:
+            write_film(recording, path, FILM, 15.0)
+        content = path.read_bytes()
+        path.unlink()
+        return f"kick.{kind}", content
+
+    def _window(self, task: Task) -> Callable[[int], Window]:
+        """What is set on the page at the moment of each plan."""
+
+        def at(step: int) -> Window:
+            wishes = self.page.wishes
+            return task.window(wishes.target)(step)._replace(weights=wishes.terms)
+
+        return at
+
+    def _ready(self, wishes: Wishes) -> bool:
+        """Whether there are planners for what is wished for; says so where they are new, or cannot be had."""
+        try:
+            if self._key(wishes) not in self._fitted:
+                self.page.tell("**Setting up** what is new: the first plan compiles, for some seconds.")
+            self.planners(wishes)
+        except ValueError as error:
+            self.page.tell(f"**Not possible:** {error}")
+            return False
+        return True
+
+    def _told(self, plans: list[Replan], wishes: Wishes) -> None:
+        """Figures of the kick that runs, and of those before."""
+        if not plans:
+            return
+        infos, every = [plan.info for plan in plans], self.planners(wishes).every
+        again = 1e3 * np.array([info.seconds for info in infos][1:] or [infos[0].seconds])
+        lost = sum(info.candidates - info.finite for info in infos)
+        lines = [
+            f"- plans: first {infos[0].seconds:.2f} s; again {np.quantile(again, 0.5):.0f} ms (p50), "
+            f"{np.quantile(again, 0.99):.0f} ms (p99), every {10 * every} ms",
+            f"- candidates lost: {lost} of {sum(info.candidates for info in infos)}",
+        ]
+        if self.errors:
+            truth, model = 100.0 * np.array(self.errors).T
+            lines.append(
+                f"- missed by {truth.mean():.1f} cm on average of {len(truth)}, the model said {model.mean():.1f}"
+            )
+        self.page.panel.figures("\n".join(lines))
+        self.page.panel.plot(
+            "Cost of the plan, by term", {n: [i.terms[n] for i in infos] for n in infos[0].terms}, "plan"
+        )
+        if len(self.errors) > 1:
+            errors = dict(zip(("in MuJoCo", "expected"), (100.0 * np.array(self.errors)).T.tolist(), strict=True))
+            self.page.panel.plot("Missed by [cm]", errors, "kick")
+
+    def _replays(self, ask: str) -> None:
+        """Keep the last kick; open one that was kept, or show it beside what is played."""
+        page = self.page
+        if ask == "keep" and self.run is not None:
+            place = self.folder / time.strftime("%Y-%m-%d_%H-%M-%S")
+            self.run.save(place)
+            self._find()
+            page.tell(f"**Kept** as {place.name}.")
+        elif ask == "alone" and page.recording is not None:
+            page.finish(page.recording)
+        elif (name := page.panel.chosen(list(self.kept))) is not None and ask in ("open", "beside"):
+            try:
+                found = opened(self.task(page.wishes.reference), self.kept[name])
+            except (ValueError, KeyError, OSError) as error:
+                page.tell(f"**Cannot be opened:** {name}: {error}")
+                return
+            other = page.recording if ask == "beside" else None
+            page.finish(found if other is None else other, None if other is None else found)
+
+    def _find(self) -> None:
+        """The kicks that are kept in the run's folder, the last one first."""
+        found = sorted(self.folder.glob("*/summary.json"), reverse=True)
+        self.kept = {path.parent.name: path.parent for path in found}
+        self.page.panel.kept(list(self.kept))
+
+
+class Interrupted(Exception):
+    """The kick that runs was asked to end."""
+
+
+def opened(task: Task, folder: Path) -> Recording:
+    """The recording of a kick that was saved. Raises ValueError where it is of another scene, or damaged."""
+    summary = json.loads((folder / "summary.json").read_text())
+    with np.load(folder / f"{task.name}.npz", allow_pickle=False) as file:
+        states, predicted, begun = (file[name] for name in ("states", "predicted_states", "plan_step"))
+    goal = task.asked(tuple(summary["target"]))
+    before = states[int(begun)][None]
+    return Recording(
+        task.scene,
+        states,
+        goal,
+        np.concatenate([before, predicted]),
+        int(begun),
+        task.reference.states[: len(states)],
+        f"{task.title(goal)} ({folder.name})",
+        task.facts(summary),
+    )

@@ -1,0 +1,312 @@
+"""The page in a real browser: it plans what is set there, kicks, plays, keeps; whoever looks does not hold it up."""
+
+from __future__ import annotations
+
+import http.server
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+import viser
+from matplotlib.image import imread
+
+from mpc import CEM
+from tasks.kick import Kick, wished
+from tasks.live import Choices, Live
+from tasks.presets import Preset
+from viewer import LivePage, Wishes
+from viewer.camera import VIEWS
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Locator, Page
+
+playwright = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+
+FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+FEW = (CEM(samples=8, rounds=1, elites=2),)
+QUICK, OTHER = Preset(FEW, FEW, every=50, stand=FEW), Preset(FEW, FEW, every=25, stand=FEW)
+TARGET = np.array([3.0, 0.2, 0.4])
+# A browser without a GPU draws so many pixels in time.
+SMALL = (640, 400)
+
+
+@dataclass
+class Served:
+    """A page that is served, and the thread that plans for it."""
+
+    page: LivePage
+    live: Live
+    thread: threading.Thread
+
+
+def until(what: Callable[[], object], seconds: float = 60.0) -> None:
+    """Wait until something is so."""
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end, "it took too long"
+        time.sleep(0.05)
+
+
+def planned_for(served: Served) -> Wishes:
+    """What the last plan that waits to be carried out is for."""
+    assert served.live.planned_for is not None
+    return served.live.planned_for
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    task = Kick.standard(substeps=4)
+    choices = Choices(
+        {"embedded": lambda: task}, {"quick": QUICK, "other": OTHER}, ("mujoco", "larp"), {"usual": task.weights}
+    )
+    with LivePage(port=0, offer=choices.offer(task)) as page:
+        live = Live(page, choices, TARGET, tmp_path_factory.mktemp("kept"), start=wished)
+        thread = threading.Thread(target=live.serve)
+        thread.start()
+        until(lambda: page._mode == "planned", 120.0)
+        page.panel._speed.value = 2.0  # type: ignore[misc]
+        yield Served(page, live, thread)
+        page.close()
+        thread.join(30.0)
+        assert not thread.is_alive(), "closing the page ends its planning"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with playwright.sync_playwright() as begun:
+        browser = begun.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+def opened(browser: Browser, served: Served, size: tuple[int, int] = SMALL) -> Page:
+    seen = browser.new_page(viewport={"width": size[0], "height": size[1]})
+    before = len(served.page._views)
+    seen.goto(served.page.address)
+    seen.get_by_text("LARP-MPC").first.wait_for()
+    until(lambda: len(served.page._views) > before)
+    return seen
+
+
+@pytest.fixture(scope="module")
+def seen(browser: Browser, served: Served) -> Iterator[Page]:
+    """One page for all tests, for opening one takes seconds where there is no GPU."""
+    page = opened(browser, served)
+    page.get_by_role("tab", name="Kick").wait_for()
+    yield page
+    page.close()
+
+
+def kick_button(seen: Page) -> Locator:
+    """The button that kicks; its key does not while a control has the keyboard."""
+    return seen.get_by_role("button", name="Kick", exact=True)
+
+
+@pytest.fixture
+def played(seen: Page, served: Served) -> Page:
+    """The page, on which a kick is played."""
+    if served.page.recording is None:
+        kicks(served, kick_button(seen).click)
+    return seen
+
+
+def pixels(seen: Page, path: Path) -> np.ndarray:
+    seen.screenshot(path=path)
+    return np.asarray(imread(path))[..., :3]
+
+
+def placed(seen: Page, served: Served, point: np.ndarray) -> tuple[float, float]:
+    """Where a point (3,) [m] is on the page, in pixels."""
+    stage, (view, aspect) = served.page._stage, [*served.page._views.values()][-1]
+    assert stage is not None
+    camera = stage.camera(next(each for each in VIEWS if each == view), aspect)
+    box = seen.locator("canvas").first.bounding_box()
+    assert box is not None
+    across, up = camera(point)
+    middle = box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"]
+    return middle[0] + 0.5 * box["width"] * across, middle[1] - 0.5 * box["width"] * up
+
+
+def drag(seen: Page, place: tuple[float, float], up: int = 40) -> None:
+    """Drag what is there upwards, as slowly as the page can follow."""
+    x, y = place
+    seen.mouse.move(x, y)
+    time.sleep(0.5)
+    seen.mouse.down()
+    for share in range(9):
+        seen.mouse.move(x, y - up * share / 8)
+        time.sleep(0.1)
+    seen.mouse.up()
+
+
+def kicks(served: Served, ask: Callable[[], object]) -> None:
+    """Ask for a kick, and wait until it is played."""
+    before = served.live.run
+    ask()
+    until(lambda: served.live.run is not before and served.page._mode == "replay")
+
+
+@pytest.mark.parametrize("size", [(1400, 900), (480, 800)], ids=["wide", "narrow"])
+def test_the_page_is_not_blank_and_has_human_and_target_in_its_picture(
+    size: tuple[int, int], browser: Browser, served: Served, tmp_path: Path
+) -> None:
+    page = opened(browser, served, size)
+    time.sleep(3.0)
+    picture = pixels(page, tmp_path / "page.png")
+    page.close()
+    green = (picture[..., 1] > picture[..., 0] + 0.12) & (picture[..., 1] > picture[..., 2] + 0.02)
+    blue = picture[..., 2] > picture[..., 0] + 0.15
+    assert (np.ptp(picture, axis=-1) > 0.3).mean() > 0.002, "nothing coloured is on the page"
+    assert green.any() and blue.any()
+
+
+def test_a_key_kicks_and_the_ball_moves(seen: Page, served: Served, tmp_path: Path) -> None:
+    before = pixels(seen, tmp_path / "before.png")
+    kicks(served, lambda: seen.keyboard.press("k"))
+    assert served.live.run is not None
+    assert served.live.run.summary["touched"]
+    assert np.linalg.norm(np.ptp(served.live.run.recording.path, axis=0)) > 0.5
+    time.sleep(1.0)
+    assert (np.abs(pixels(seen, tmp_path / "after.png") - before).max(axis=-1) > 0.1).mean() > 0.01
+
+
+def test_what_is_dragged_changes_the_plan(seen: Page, served: Served) -> None:
+    seen.get_by_text("Reset", exact=True).click()
+    until(lambda: served.page._mode == "planned")
+    time.sleep(2.0)
+    before, plans = served.page.wishes.target, served.live.plans
+    # The arrow that points up is one of few things whose place in the picture is known: above the target.
+    drag(seen, placed(seen, served, np.add(before, (0.0, 0.0, 0.25))))
+    until(lambda: served.page.wishes.target != before)
+    assert served.page.wishes.target[2] > before[2]
+    until(lambda: served.live.plans > plans and planned_for(served).target == served.page.wishes.target)
+
+
+def test_a_slider_changes_the_weight_of_its_cost_and_the_plan(seen: Page, served: Served) -> None:
+    before = served.page.wishes.terms["effort"]
+    seen.get_by_role("tab", name="Costs").click()
+    enter(seen, "effort", "2.5")
+    until(lambda: served.page.wishes.terms["effort"] == 2.5)
+    until(lambda: planned_for(served).terms["effort"] == 2.5)
+    seen.get_by_role("button", name="As they were").click()
+    until(lambda: served.page.wishes.terms["effort"] == before)
+
+
+def enter(seen: Page, label: str, value: str) -> None:
+    """Type a number beside a slider."""
+    number = seen.locator("div", has=seen.get_by_text(label, exact=True)).last.locator("xpath=..").locator("input").last
+    number.fill(value)
+    number.press("Enter")
+
+
+@pytest.mark.parametrize(
+    ("label", "field", "value"), [("Preset", "preset", "other"), ("Model", "dynamics", "larp")], ids=["preset", "model"]
+)
+def test_the_next_plan_is_by_the_preset_and_the_model_that_are_chosen(
+    label: str, field: str, value: str, seen: Page, served: Served
+) -> None:
+    seen.get_by_role("tab", name="Kick").click()
+    before = getattr(served.page.wishes, field)
+    for chosen in (value, before):
+        choose(seen, label, chosen)
+        until(lambda: getattr(planned_for(served), field) == chosen, 120.0)  # noqa: B023
+
+
+def choose(seen: Page, label: str, value: str) -> None:
+    """Choose from a list."""
+    seen.locator("div", has=seen.get_by_text(label, exact=True)).last.locator("xpath=..").locator("input").first.click()
+    seen.get_by_role("option", name=value, exact=True).click()
+
+
+def test_time_stands_still_goes_step_by_step_and_goes_on(played: Page, served: Served) -> None:
+    seen = played
+    seen.keyboard.press("Space")
+    until(lambda: not served.page.playing)
+    panel = served.page.panel
+    stood = panel.time
+    time.sleep(0.3)
+    assert panel.time == stood
+    seen.get_by_text("Step", exact=True).click()
+    until(lambda: panel.time == pytest.approx(stood + 0.01))
+    seen.keyboard.press("Space")
+    until(lambda: panel.time > stood + 0.1)
+
+
+def test_a_kick_is_kept_opened_again_and_shown_beside_another(played: Page, served: Served) -> None:
+    seen = played
+    seen.get_by_role("tab", name="Kept").click()
+    seen.get_by_role("button", name="Keep this kick").click()
+    until(lambda: served.live.kept)
+    (folder,) = served.live.kept.values()
+    assert {path.name for path in folder.iterdir()} == {"summary.json", "kick.npz", "kick.png", "kick.html"}
+    last = served.page.recording
+    seen.get_by_role("button", name="Open", exact=True).click()
+    until(lambda: served.page.recording is not None and served.page.recording is not last)
+    found = served.page.recording
+    assert found is not None and last is not None
+    np.testing.assert_allclose(found.path, last.path, atol=1e-5)
+    assert found.summary == last.summary
+    seen.get_by_role("button", name="Show beside").click()
+    until(lambda: served.page._beside is not None)
+    seen.get_by_role("button", name="Take away what is beside").click()
+    until(lambda: served.page._beside is None)
+
+
+def test_a_push_moves_the_body_that_it_is_for(seen: Page, served: Served) -> None:
+    before = served.live.run
+    kick_button(seen).click()
+    until(lambda: served.page._mode == "running")
+    seen.keyboard.press("b")
+    until(lambda: served.live.run is not before)
+    assert served.live.run is not None
+    change = np.diff(served.live.run.states[:, -1, 8])  # of the ball's velocity to the left
+    assert change.max() > 0.8, "1 m/s is set"
+
+
+@pytest.mark.parametrize("kind", ["html", "png"])
+def test_what_is_played_can_be_downloaded(kind: str, played: Page, tmp_path: Path) -> None:
+    button = played.get_by_role("button", name=kind, exact=True)
+    if not button.is_visible():
+        played.get_by_text("View", exact=True).click()
+    with played.expect_download(timeout=60_000) as begun:
+        button.click()
+    begun.value.save_as(tmp_path / "file")
+    assert (tmp_path / "file").read_bytes()[:4] == (b"<!do" if kind == "html" else b"\x89PNG")
+
+
+def test_a_page_of_elsewhere_cannot_connect(browser: Browser, served: Served, tmp_path: Path) -> None:
+    (tmp_path / "index.html").write_text("<title>elsewhere</title>")
+    handler = partial(http.server.SimpleHTTPRequestHandler, directory=str(tmp_path))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as foreign:
+        threading.Thread(target=foreign.serve_forever, daemon=True).start()
+        page = browser.new_page()
+        page.goto(f"http://127.0.0.1:{foreign.server_port}")
+        asked = """address => new Promise(done => {
+            const socket = new WebSocket(address, "viser-v%s");
+            socket.onopen = () => done("let in");
+            socket.onerror = () => done("refused");
+        })"""
+        said = page.evaluate(asked % viser.__version__, served.page.address.replace("http", "ws"))
+        page.close()
+        foreign.shutdown()
+    assert said == "refused"
+
+
+def test_reloads_do_not_hold_up_who_plans(played: Page, served: Served) -> None:
+    seen = played
+    before = served.live.run
+    kick_button(seen).click()
+    for _ in range(4):
+        seen.reload(wait_until="commit")
+    until(lambda: served.live.run is not before)
+    assert served.live.run is not None and served.live.run.truth_error_m < np.inf
+    until(lambda: len(served.page._views) == 1)

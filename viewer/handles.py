@@ -1,0 +1,109 @@
+"""What is dragged in the picture: the target, the resting ball's spot, and how it rolls."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import viser
+
+from viewer.checked import vector
+from viewer.wishes import Offer
+
+SIZE = 0.45  # m, of a handle's arrows
+LEAD = 0.3  # s: an arrow ends where the ball would be so much later
+ROLLING, FAINT = (204, 121, 167), (140, 190, 170)
+
+
+class Handles:
+    """Of one page, all its clients together; every value is brought within what is offered."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        offer: Offer,
+        target: Sequence[float],
+        ball: np.ndarray,
+        changed: Callable[[], None],
+    ) -> None:
+        """target: (3,) [m], where it is at first. ball: (3,) [m], where the ball usually lies. changed: see `Panel`."""
+        self._server, self._offer, self._ball, self._changed = server, offer, np.asarray(ball, float), changed
+        self.target: tuple[float, ...] = tuple(map(float, target))
+        self.spot: tuple[float, ...] = (0.0, 0.0)
+        self.roll: tuple[float, ...] = (0.0, 0.0)
+        flat: dict[str, Any] = {"disable_rotations": True, "active_axes": (True, True, False)}
+        self._target = self._handle("target", {"disable_rotations": True}, SIZE)
+        self._spot = self._handle("spot", flat, 0.7 * SIZE)
+        self._roll = self._handle("roll", flat, 0.5 * SIZE)
+        self._hint()
+        self._settle()
+
+    def _handle(self, name: str, style: dict[str, Any], size: float) -> viser.TransformControlsHandle:
+        handle = self._server.scene.add_transform_controls(f"/handles/{name}", size, depth_test=False, **style)
+
+        @handle.on_update
+        async def _(event: viser.TransformControlsEvent) -> None:
+            self._take(name, handle.position)
+            if event.phase == "end":
+                self._settle()
+            self._changed()
+
+        return handle
+
+    def _take(self, name: str, place: np.ndarray) -> None:
+        """Where a handle has been dragged to."""
+        offer = self._offer
+        if name == "target":
+            self.target = tuple(map(float, vector(place, *offer.target)))
+        elif name == "spot":
+            self.spot = self._flat(np.asarray(place) - self._ball, offer.spot)
+        else:
+            self.roll = self._flat((np.asarray(place) - self.resting) / LEAD, offer.roll)
+        self._arrow()
+
+    @staticmethod
+    def _flat(value: np.ndarray, box: tuple[tuple[float, ...], tuple[float, ...]]) -> tuple[float, ...]:
+        return tuple(map(float, vector(value, (*box[0], 0.0), (*box[1], 0.0))[:2]))
+
+    def _settle(self) -> None:
+        """Put the handles where they count: those dragged out of what is offered come back to its edge."""
+        resting = self.resting
+        with self._server.atomic():
+            self._target.position = np.array(self.target)
+            self._spot.position = resting
+            self._roll.position = resting + LEAD * np.array((*self.roll, 0.0))
+        self._arrow()
+
+    def _arrow(self) -> None:
+        """How the ball rolls, as an arrow; none where it rests."""
+        begin = self.resting
+        end = begin + LEAD * np.array((*self.roll, 0.0))
+        if np.linalg.norm(self.roll) < 0.1:
+            self._server.scene.remove_by_name("/handles/rolling")
+        else:
+            points = np.array([[begin, end]], np.float32)
+            self._server.scene.add_arrows("/handles/rolling", points, ROLLING)
+
+    def _hint(self) -> None:
+        """What can be reached, as an outline on the ground."""
+        (low_x, low_y, _), (high_x, high_y, _) = self._offer.target
+        corners = np.array([(low_x, low_y), (high_x, low_y), (high_x, high_y), (low_x, high_y)])
+        ring = np.concatenate([corners, np.full((4, 1), 0.01)], axis=1)
+        segments = np.stack([ring, np.roll(ring, -1, axis=0)], axis=1).astype(np.float32)
+        self._server.scene.add_line_segments("/handles/reach", segments, FAINT, thickness=0.008)
+
+    @property
+    def resting(self) -> np.ndarray:
+        """Where the ball is (3,) [m]."""
+        return self._ball + np.array((*self.spot, 0.0))
+
+    def again(self, before: Handles) -> None:
+        """Set all as it was with handles of before."""
+        self.target, self.spot, self.roll = before.target, before.spot, before.roll
+        self._settle()
+
+    def shown(self, visible: bool) -> None:
+        """Show them all, or only the target."""
+        for handle in (self._spot, self._roll):
+            handle.visible = visible

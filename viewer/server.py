@@ -1,0 +1,245 @@
+"""The server behind the page: who may enter, what a client may change, and how it begins and ends."""
+
+from __future__ import annotations
+
+import io
+import logging
+import re
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import redirect_stdout, suppress
+from errno import EACCES, EADDRINUSE
+from http import HTTPStatus
+from ipaddress import ip_address
+from typing import Any
+
+import msgspec
+import viser
+import websockets.asyncio.server as listener
+from viser import _messages as messages
+from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+from viewer.checked import alike
+
+RESOLVING = 1.5  # s until a host's name must be known
+PATIENCE = 0.5  # s in which a client may answer that the server closes
+LARGEST_MESSAGE = 2**20  # bytes; from a client, whose messages here are of a few hundred
+
+# What a client of Viser may ask for, and no page of ours offers.
+REFUSED = (
+    messages.ShareUrlRequest,
+    messages.ShareUrlDisconnect,
+    messages.GuiFormSubmitMessage,
+    messages.GuiFormDirtyMessage,
+    messages.FileTransferStartUpload,
+    messages.FileTransferPart,
+)
+
+# What stands for the fields that name or place something in a client's message, whatever its kind.
+FIELDS: dict[str, Any] = {
+    **dict.fromkeys(("name", "uuid", "owner"), ""),
+    **dict.fromkeys(("position", "look_at", "up_direction"), (0.0, 0.0, 0.0)),
+    "wxyz": (1.0, 0.0, 0.0, 0.0),
+    **dict.fromkeys(("fov", "near", "far"), 1.0),
+}
+
+_STARTING = threading.Lock()
+_HOST = re.compile(r"(\[[0-9a-f:.]+\]|[^\[\]:]+)(:[0-9]{1,5})?")
+
+
+def open_server(host: str = "127.0.0.1", port: int = 8080) -> viser.ViserServer:
+    """A silent Viser server on exactly this address; port 0 takes a free one.
+
+    It answers only requests for this address that come from its own page or from no page at all. A host that others
+    can reach is warned of on stderr. Raises ValueError where the address cannot be had: Viser itself would move to
+    another port, or try for ever.
+    """
+    listening = _listening(host, port)
+    local = is_loopback(listening.getsockname()[0])
+    try:
+        with redirect_stdout(io.StringIO()):
+            server = _Server(host, listening, local)
+    except BaseException:
+        listening.close()
+        raise
+    if not local:
+        print(f"host {host}: anyone who reaches this machine can use the page", file=sys.stderr)
+    return server
+
+
+def close_server(server: viser.ViserServer) -> None:
+    """Stop a server, silently and within seconds, whatever its clients do."""
+    with redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+def address_of(server: viser.ViserServer) -> str:
+    """What to type into a browser on this machine."""
+    return f"http://{_bracketed(server.get_host())}:{server.get_port()}"
+
+
+def is_loopback(address: str) -> bool:
+    """Whether only this machine reaches the numeric address."""
+    return ip_address(address).is_loopback
+
+
+def names_of(host: str, local: bool) -> frozenset[str]:
+    """Hosts by which a browser may ask for a server bound to this one, without ports: forwarding changes these."""
+    here = ("127.0.0.1", "[::1]") if local else (socket.gethostname(),)
+    return frozenset(name.lower() for name in ("localhost", _bracketed(host), *here))
+
+
+def admits(headers: Headers, names: frozenset[str], addresses: bool) -> bool:
+    """Whether a request is for one of these names and, where a page sent it, from the page of this very server.
+
+    addresses: whether any IP address will do as a name. To reach us, the page of another site must be served under
+    a name that its owner first has resolve to itself and then to us; it is that name which gives it away.
+    """
+    hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+    asked = _HOST.fullmatch(hosts[0].lower()) if len(hosts) == 1 else None
+    if asked is None or not (asked[1] in names or (addresses and _is_address(asked[1]))):
+        return False
+    return not origins or [origin.lower() for origin in origins] in ([f"http://{asked[0]}"], [f"https://{asked[0]}"])
+
+
+def is_sound(raw: str | bytes) -> bool:
+    """Whether a client's message has names that are text and places that are finite vectors of their length.
+
+    Viser would put them into its state as they are. What it cannot read at all passes here: it then drops the sender.
+    """
+    try:
+        message = msgspec.msgpack.decode(raw) if isinstance(raw, bytes) else None
+    except (msgspec.DecodeError, RecursionError, UnicodeError):
+        return True
+    return not isinstance(message, dict) or all(
+        alike(message[name], pattern) for name, pattern in FIELDS.items() if name in message
+    )
+
+
+class _Connection(ServerConnection):
+    async def recv(self, decode: bool | None = None) -> Any:
+        """The next message that is sound; others are dropped."""
+        while not is_sound(raw := await super().recv(decode)):
+            pass
+        return raw
+
+
+class _Server(viser.ViserServer):
+    """Viser has no hook for whom to serve, so for its start it meets another `serve` in the place of websockets'."""
+
+    def __init__(self, host: str, listening: socket.socket, local: bool) -> None:
+        """listening: bound to the host, which is local if only this machine reaches it. Closed by `stop`."""
+        names = names_of(host, local)
+        self._served: listener.serve | None = None
+        with _STARTING:
+            serve = listener.serve
+
+            def guarded(handler: Any, *address: Any, **options: Any) -> listener.serve:
+                viser_server = vars(self).get("_websock_server")
+                if viser_server is None or viser_server._server_thread is not threading.current_thread():
+                    return serve(handler, *address, **options)  # for someone else in this process
+                options["process_request"] = _guard(options["process_request"], names, not local)
+                options["create_connection"] = _Connection
+                options["max_size"] = LARGEST_MESSAGE
+                options["logger"] = logging.Logger("viewer", logging.CRITICAL)  # or strangers write to our terminal
+                self._served = serve(handler, sock=listening, **options)
+                return self._served
+
+            listener.serve = guarded  # type: ignore[assignment,misc]
+            try:
+                super().__init__(host, listening.getsockname()[1], verbose=False)
+            finally:
+                listener.serve = serve  # type: ignore[misc]
+        if self._served is None:
+            self.stop()
+            raise RuntimeError(f"Viser {viser.__version__} opens its server in a way that cannot be guarded")
+        for kind in REFUSED:
+            self._websock_server.unregister_handler(kind)
+        self._websock_server.unregister_handler(messages.GuiUpdateMessage)
+        self._websock_server.register_handler(messages.GuiUpdateMessage, self._change)
+
+    def stop(self) -> None:
+        """Close all connections and end all threads; clients that do not answer are cut off."""
+        if self._served is not None:
+            loop = self._served.server.loop
+            with suppress(RuntimeError):  # it is closed already
+                loop.call_soon_threadsafe(loop.call_later, PATIENCE, self._cut_off)
+        super().stop()
+
+    def request_share_url(self, verbose: bool = True) -> None:
+        """There is no public address."""
+
+    def disconnect_share_url(self) -> None:
+        """There is no public address."""
+
+    def _cut_off(self) -> None:
+        assert self._served is not None
+        for connection in tuple(self._served.server.handlers):
+            connection.transport.abort()
+
+    async def _change(self, client: Any, message: messages.GuiUpdateMessage) -> None:
+        """A client may change the value of a control. Viser would let it set any attribute of it, to anything."""
+        control = self.gui._gui_input_handle_from_uuid.get(message.uuid)
+        if control is None or not isinstance(message.updates, dict) or [*message.updates] != ["value"]:
+            return
+        if alike(message.updates["value"], control.value):
+            await self.gui._handle_gui_updates(client, message)
+
+
+Answer = Callable[[ServerConnection, Request], Response | None]
+
+
+def _guard(answer: Answer, names: frozenset[str], addresses: bool) -> Answer:
+    def guarded(connection: ServerConnection, request: Request) -> Response | None:
+        if admits(request.headers, names, addresses):
+            return answer(connection, request)
+        return connection.respond(HTTPStatus.FORBIDDEN, "This page is served only under its own address.\n")
+
+    return guarded
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    """A socket that listens there, so that nobody can take the port between the question and the answer."""
+    if not isinstance(port, int) or not 0 <= port < 2**16:
+        raise ValueError(f"port is {port!r}, but must be an integer in [0, 65536)")
+    try:
+        family, address = _resolved(host, port)
+        return socket.create_server(address, family=family)
+    except OSError as error:
+        if error.errno in (EACCES, EADDRINUSE):
+            raise ValueError(f"port {port} of host {host!r} cannot be opened: {error}; choose another") from None
+        raise ValueError(f"host is {host!r}, but must be an address or a name of this machine: {error}") from None
+
+
+def _resolved(host: str, port: int) -> tuple[socket.AddressFamily, Any]:
+    """Family and address, IPv4 where there is one. Raises OSError, also where the answer takes too long."""
+    found: list[Any] = []
+
+    def look() -> None:
+        try:
+            found.extend(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM) if host else ())
+        except (OSError, ValueError) as error:  # a name can also be malformed
+            found.append(error)
+
+    looking = threading.Thread(target=look, daemon=True)
+    looking.start()
+    looking.join(RESOLVING)
+    if not found or isinstance(found[0], Exception):
+        raise OSError(found[0] if found else "nobody knows it")
+    family, _, _, _, address = min(found, key=lambda each: each[0] != socket.AF_INET)
+    return family, address
+
+
+def _bracketed(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
+
+
+def _is_address(name: str) -> bool:
+    with suppress(ValueError):
+        ip_address(name.removeprefix("[").removesuffix("]"))
+        return True
+    return False
