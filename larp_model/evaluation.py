@@ -25,25 +25,35 @@ LAUNCH_STEPS = 8
 LAUNCH_SPEED = 1.5
 # Beyond this a prediction has diverged [m].
 DIVERGED = 20.0
+# Steps, to whose multiples rollouts are filled up: one program, then, serves all windows of a kick.
+PADDED = 64
 
 
 def predict(
     simulator: Simulator, states: np.ndarray, controls: np.ndarray, torques: np.ndarray, morphology: np.ndarray,
     chunk: int = 128,
 ) -> np.ndarray:  # fmt: skip
-    """States (E, H, L, 13) that the simulator predicts from states (E, L, 13), chunk by chunk."""
-    parts = []
+    """States (E, H, L, 13) that the simulator predicts from states (E, L, 13), chunk by chunk.
+
+    What is compiled serves any H up to a multiple of `PADDED`.
+    """
+    parts, steps = [], controls.shape[1]
+    rest = ((0, 0), (0, -steps % PADDED), (0, 0), (0, 0))
+    controls, torques = np.pad(controls, rest), np.pad(torques, rest)
     for begin in range(0, len(states), chunk):
         rows = np.minimum(np.arange(begin, begin + chunk), len(states) - 1)
         start, targets, pushes, sizes = (jnp.asarray(each[rows]) for each in (states, controls, torques, morphology))
-        parts.append(np.asarray(_roll(simulator.model, simulator.weights, start, targets, pushes, sizes)))
+        rolled = _roll(simulator.model, simulator.weights, start, targets, pushes, sizes, jnp.asarray(steps))
+        parts.append(np.asarray(rolled)[:, :steps])
     return np.concatenate(parts)[: len(states)]
 
 
 @partial(jax.jit, static_argnums=0)
-def _roll(model: Model, weights: Weights, start: Array, targets: Array, pushes: Array, sizes: Array) -> Array:
+def _roll(
+    model: Model, weights: Weights, start: Array, targets: Array, pushes: Array, sizes: Array, steps: Array
+) -> Array:
     """Compiled once for all weights of a model."""
-    return Simulator(model, weights).rollout(start, targets, torques=pushes, morphology=sizes)
+    return Simulator(model, weights).rollout(start, targets, torques=pushes, morphology=sizes, steps=steps)
 
 
 def evaluate(simulator: Simulator, episodes: Trajectories, windows: Sequence[int]) -> dict[str, Any]:

@@ -6,7 +6,6 @@ Physics alone; what the contact network makes of it is in `parts.contact`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -261,6 +260,10 @@ def first_contact(scene: Scene, states: Array, morphology: Array) -> Array:
 
 def first_contacts(scene: Scene, episodes: Trajectories, chunk: int = 512) -> np.ndarray:
     """`first_contact` (E,) of many trajectories, chunk by chunk."""
-    found, count = jax.jit(partial(first_contact, scene)), len(episodes.states)
+    count = len(episodes.states)
     rows = np.minimum(np.arange(count + -count % chunk), count - 1).reshape(-1, chunk)
-    return np.concatenate([found(episodes.states[each], episodes.morphology[each]) for each in rows])[:count]
+    found = (_first_contact(scene, episodes.states[each], episodes.morphology[each]) for each in rows)
+    return np.concatenate(list(found))[:count]
+
+
+_first_contact = jax.jit(first_contact, static_argnums=0)

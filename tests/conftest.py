@@ -17,6 +17,7 @@ from larp_model.parts.part import Model
 from larp_model.scene import Scene
 from larp_model.training import Recipe, Windows, statistics_of
 from larp_model.truth.episodes import Episodes
+from tasks.command import remember_compilations
 from tasks.data import random_episodes
 from tasks.motions.references import Reference, embedded
 
@@ -27,9 +28,12 @@ settings.load_profile("repeatable")
 
 @pytest.fixture(autouse=True, scope="session")
 def a_cache_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Commands remember what they compile: here not in the user's cache, nor in that of another process."""
+    """What is compiled is remembered from one file of tests to the next, as commands remember it from run to run: here
+    not in the user's cache, nor in that of another process.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        remember_compilations()
         yield
 
 

@@ -122,6 +122,7 @@ ORDER = [
     "tasks.benchmarks.pushes",
     "tasks.benchmarks.slopes",
     "tasks.benchmarks.stability",
+    "tasks.benchmarks.page",
     "tasks.benchmarks.__main__",
     "tasks.benchmarks",
     "tasks",

@@ -72,7 +72,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         live = Live(page, choices, TARGET, tmp_path_factory.mktemp("kept"), start=wished)
         thread = threading.Thread(target=live.serve)
         thread.start()
-        until(lambda: page._mode == "planned", 120.0)
+        until(lambda: page.mode == "planned", 120.0)
         page.panel._speed.value = 2.0  # type: ignore[misc]
         yield Served(page, live, thread)
         page.close()
@@ -152,7 +152,7 @@ def kicks(served: Served, ask: Callable[[], object]) -> None:
     """Ask for a kick, and wait until it is played."""
     before = served.live.run
     ask()
-    until(lambda: served.live.run is not before and served.page._mode == "replay")
+    until(lambda: served.live.run is not before and served.page.mode == "replay")
 
 
 @pytest.mark.parametrize("size", [(1400, 900), (480, 800)], ids=["wide", "narrow"])
@@ -181,7 +181,7 @@ def test_a_key_kicks_and_the_ball_moves(seen: Page, served: Served, tmp_path: Pa
 
 def test_what_is_dragged_changes_the_plan(seen: Page, served: Served) -> None:
     seen.get_by_text("Reset", exact=True).click()
-    until(lambda: served.page._mode == "planned")
+    until(lambda: served.page.mode == "planned")
     time.sleep(2.0)
     before, plans = served.page.wishes.target, served.live.plans
     # The arrow that points up is one of few things whose place in the picture is known: above the target.
@@ -264,7 +264,7 @@ def test_a_kick_is_kept_opened_again_and_shown_beside_another(played: Page, serv
 def test_a_push_moves_the_body_that_it_is_for(seen: Page, served: Served) -> None:
     before = served.live.run
     kick_button(seen).click()
-    until(lambda: served.page._mode == "running")
+    until(lambda: served.page.mode == "running")
     seen.keyboard.press("b")
     until(lambda: served.live.run is not before)
     assert served.live.run is not None

@@ -65,7 +65,7 @@ class LivePage:
         self.address = address_of(self._server)
         self.offer = offer
         self._lock, self._closed, self._moved = threading.RLock(), threading.Event(), threading.Event()
-        self._changes = 0
+        self._changes = self._frames = 0
         self._asked: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._mode: Mode = "waiting"
         self._stage: Stage | None = None
@@ -114,6 +114,27 @@ class LivePage:
         elif name != "play":
             self._asked.put(name)
         self._moved.set()
+
+    def ask(self, name: str) -> None:
+        """Ask for something as a client would: "kick", "reset", "push ball", ..."""
+        self._ask(name, None)
+
+    def aim(self, target: np.ndarray) -> None:
+        """Drag the target to (3,) [m]; it comes within what is offered."""
+        with self._lock:
+            assert self._handles is not None
+            self._handles.aim(target)
+        self._change()
+
+    @property
+    def frames(self) -> int:
+        """How many pictures have been drawn."""
+        return self._frames
+
+    @property
+    def mode(self) -> Mode:
+        """What the page is at."""
+        return self._mode
 
     @property
     def wishes(self) -> Wishes:
@@ -329,6 +350,7 @@ class LivePage:
                 lane.show(each.states[own], prediction=each.predicted_at(own), reference=each.reference_at(own))
         self._follow(stage.lane.position(recording.states[min(row, len(recording.states) - 1)]))
         self._drawn = row, ghosts
+        self._frames += 1
 
     def _draw_news(self, stage: Stage, news: News) -> None:
         lane, plan = stage.lane, news.plan
@@ -340,6 +362,7 @@ class LivePage:
                 step = int(clock.monotonic() / self._scene.dt * self._panel.speed) % len(plan)
             expected = known(plan)[step] if 0 <= step < len(plan) else None
         lane.show(news.state, prediction=expected, reference=news.reference)
+        self._frames += 1
         path = np.array(news.path) if news.path else None
         miss = lane.trace(path, None if plan is None else lane.position(plan))
         if news.fan is not None and "fan" in lane.shown:

@@ -98,6 +98,11 @@ class Handles:
         """Where the ball is (3,) [m]."""
         return self._ball + np.array((*self.spot, 0.0))
 
+    def aim(self, target: Sequence[float] | np.ndarray) -> None:
+        """Put the target (3,) [m] where it is wanted, as if it had been dragged."""
+        self._take("target", np.asarray(target, float))
+        self._settle()
+
     def again(self, before: Handles) -> None:
         """Set all as it was with handles of before."""
         self.target, self.spot, self.roll = before.target, before.spot, before.roll

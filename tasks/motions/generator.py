@@ -166,7 +166,8 @@ def feet(
     both = np.concatenate(first)[: len(states), :, either - own.start, :3]
     still = ~np.isfinite(both).all(axis=(1, 2, 3))
     both[still] = states[still][:, None, either, :3]
-    chosen = (random.random(len(states)) < 0.5).astype(int)
-    fastest = np.linalg.norm(np.diff(both, axis=1), axis=-1).max(axis=1).argmax(axis=-1)
-    chosen = np.where(random.random(len(states)) < faster, fastest, chosen)
+    chosen = (random.random(len(states)) >= 0.5).astype(int)
+    if faster:
+        fastest = np.linalg.norm(np.diff(both, axis=1), axis=-1).max(axis=1).argmax(axis=-1)
+        chosen = np.where(random.random(len(states)) < faster, fastest, chosen)
     return both[np.arange(len(states)), :, chosen]

@@ -1,0 +1,223 @@
+"""What watching costs: plans with a page and its clients beside plans without, and what a page leaves behind.
+
+Clients are websockets that take everything and draw nothing, some of them slowly; some leave and come back. They run in
+a process of their own, as browsers do.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import viser
+from matplotlib.figure import Figure
+from rich.table import Table
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from tasks.benchmarks import report
+from tasks.command import remember_compilations, run
+from tasks.data import random_task
+from tasks.kick import USUAL, Kick, wished
+from tasks.live import Choices, Live, weights_for
+from tasks.presets import PRESETS, PresetName
+from viewer import LivePage
+
+# Every so many clients one is slow: it waits so long before each message [s].
+SLOW, PATIENCE = 5, 0.5
+# A client that comes again stays for so long [s].
+STAYS = 3.0
+WARM_UP = 3
+
+
+def watch(address: str, clients: int, coming: bool) -> None:
+    """Be so many clients until ended; where some are `coming`, one more comes, stays a while and leaves, on and on."""
+
+    def one(number: int, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        try:
+            with connect(address, subprotocols=[Subprotocol(f"viser-v{viser.__version__}")], max_size=None) as socket:
+                while time.monotonic() < end:
+                    if number % SLOW == SLOW - 1:
+                        time.sleep(PATIENCE)
+                    try:
+                        socket.recv(timeout=0.2)
+                    except TimeoutError:
+                        continue
+        except (ConnectionClosed, OSError):
+            return
+
+    threads = [threading.Thread(target=one, args=(number, 1e9), daemon=True) for number in range(clients)]
+    for thread in threads:
+        thread.start()
+    while coming:
+        one(0, STAYS)
+    threads[0].join()
+
+
+def until(what: Callable[[], object], seconds: float = 120.0) -> float:
+    """Wait until something is so; returns for how long [s]."""
+    begin = time.monotonic()
+    while not what():
+        if time.monotonic() - begin > seconds:
+            raise RuntimeError(f"nothing happened for {seconds:g} s")
+        time.sleep(0.002)
+    return time.monotonic() - begin
+
+
+def of_kick(live: Live, ask: Callable[[], None]) -> report.Row:
+    """A kick on the page: what its plans took, its miss, and how often it was drawn [1/s]."""
+    page, before, frames = live.page, live.run, live.page.frames
+    begin = time.monotonic()
+    ask()
+    until(lambda: live.run is not before and page.mode == "replay")
+    assert live.run is not None
+    summary = live.run.summary
+    return {
+        "plan_seconds": summary["plan_seconds"],
+        "replan_ms": summary["replan_ms"]["p50"],
+        "truth_error_m": summary["truth_error_m"],
+        "frames_per_second": (page.frames - frames) / (time.monotonic() - begin),
+    }
+
+
+def of_drag(live: Live, target: np.ndarray) -> report.Row:
+    """The target dragged: how long it took until the new plan was drawn [s]."""
+    page = live.page
+    begin, plans = time.monotonic(), live.plans
+    page.aim(target)
+    until(lambda: live.plans > plans)
+    frames = page.frames
+    until(lambda: page.frames > frames + 1)
+    return {"drag_seconds": time.monotonic() - begin}
+
+
+def main(
+    kicks: int = 20,
+    clients: int = 10,
+    preset: PresetName = "fast",
+    seed: int = 7,
+    json: Path = Path("runs/benchmarks/page.json"),
+    publish: bool = False,
+) -> None:
+    """Measure what a page costs whoever plans, and whether it leaves anything behind.
+
+    Args:
+        kicks: with the page, and as many without.
+        clients: that watch, a fifth of them slow; one more comes and goes.
+        preset: of the plans.
+        seed: of the targets.
+        json: where the figures go.
+        publish: update RESULTS.md.
+    """
+    if kicks < 1 or clients < 1:
+        raise ValueError(f"kicks and clients are {kicks} and {clients}, but must be at least 1")
+    report.ready(json, publish)
+    remember_compilations()
+    random = np.random.default_rng(seed)
+    targets = [random_task(random)[0] for _ in range(kicks)]
+    kick = Kick.standard()
+    choices = Choices({"embedded": lambda: kick}, {preset: PRESETS[preset]}, ("larp",), weights_for(kick, None))
+    process = psutil.Process()
+    before = process.num_threads()
+    with tempfile.TemporaryDirectory() as folder, LivePage(port=0, offer=choices.offer(kick)) as page:
+        live = Live(page, choices, USUAL, Path(folder), seed, wished)
+        thread = threading.Thread(target=live.serve)
+        thread.start()
+        until(lambda: page.mode == "planned", 300.0)
+        address = page.address.replace("http", "ws")
+        spawn = multiprocessing.get_context("spawn")
+        watching = spawn.Process(target=watch, args=(address, clients, True), daemon=True)
+        watching.start()
+        until(lambda: len(process.net_connections("tcp")) > clients, 60.0)
+        for _ in range(WARM_UP):
+            of_kick(live, partial(page.ask, "kick"))
+        memory = process.memory_info().rss
+        # In turn, for the machine may be slower later on.
+        jobs: dict[str, Callable[[], report.Row]] = {}
+        for index, target in enumerate(targets):
+            jobs[f"drag {index}"] = partial(of_drag, live, target)
+            jobs[f"watched {index}"] = partial(of_kick, live, partial(page.ask, "kick"))
+            jobs[f"alone {index}"] = partial(headless, live, kick, target, preset, seed)
+        command = f"python -m tasks.benchmarks.page --kicks {kicks} --clients {clients} --preset {preset} --seed {seed}"
+        rows = dict(zip(jobs, report.collect(json, command, jobs), strict=True))
+        grown = process.memory_info().rss / memory - 1.0
+        watching.kill()
+        page.close()
+        thread.join()
+    figures = summary(rows) | {
+        "memory_growth": grown,
+        "sockets_left": len(process.net_connections("tcp")),
+        "threads_before": before,
+        "threads_after": process.num_threads(),
+    }
+    report.write_json(json, {"command": command, "hardware": report.hardware(), **figures, "rows": rows})
+    report.write_picture(json.with_suffix(".png"), picture(rows))
+    table = Table("measure", "value", title=f"The page: {kicks} kicks of {preset}, {clients} clients")
+    for name, value in (
+        ("replan, watched and alone (median)", "{watched_ms:.0f} and {alone_ms:.0f} ms".format(**figures)),
+        ("slower by (median of pairs)", f"{100 * figures['slower']:.1f} %"),
+        (
+            "from a drag to the new plan on the page (median, worst)",
+            "{drag_s:.2f}, {drag_worst_s:.2f} s".format(**figures),
+        ),
+        ("drawn while it kicks", f"{figures['frames_per_second']:.0f} times a second"),
+        ("memory grew by", f"{100 * grown:.1f} %"),
+        ("sockets left", str(figures["sockets_left"])),
+        ("threads before and after", f"{before} and {figures['threads_after']}"),
+    ):
+        table.add_row(name, value)
+    report.show(table)
+    if publish:
+        report.publish("page", "The page", command, table)
+
+
+def headless(live: Live, kick: Kick, target: np.ndarray, preset: PresetName, seed: int) -> report.Row:
+    """The same kick while nothing is drawn."""
+    live.page.panel.playing = False
+    found = kick.to(target, preset, seed=seed).summary
+    live.page.panel.playing = True
+    return {"plan_seconds": found["plan_seconds"], "replan_ms": found["replan_ms"]["p50"]}
+
+
+def summary(rows: dict[str, report.Row]) -> dict[str, Any]:
+    """The figures of all rows."""
+
+    def values(kind: str, name: str) -> np.ndarray:
+        return np.array([row[name] for key, row in rows.items() if key.startswith(kind)])
+
+    watched, alone = values("watched", "replan_ms"), values("alone", "replan_ms")
+    drags = values("drag", "drag_seconds")
+    return {
+        "watched_ms": float(np.median(watched)),
+        "alone_ms": float(np.median(alone)),
+        "slower": float(np.median(watched / alone) - 1.0),
+        "drag_s": float(np.median(drags)),
+        "drag_worst_s": float(drags.max()),
+        "frames_per_second": float(np.median(values("watched", "frames_per_second"))),
+    }
+
+
+def picture(rows: dict[str, report.Row]) -> Figure:
+    """Replans of each kick, watched and alone."""
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.subplots()
+    for kind, colour in (("watched", "#d55e00"), ("alone", "#0072b2")):
+        values = [row["replan_ms"] for key, row in rows.items() if key.startswith(kind)]
+        axes.plot(values, marker="o", ls="", color=colour, label=kind)
+    axes.set(xlabel="kick", ylabel="replan, median [ms]", title="Plans with and without a page", ylim=(0.0, None))
+    axes.legend(frameon=False)
+    return figure
+
+
+if __name__ == "__main__":
+    run(main)
