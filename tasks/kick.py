@@ -202,11 +202,6 @@ def main(
     called = " ".join((preset, *change))
 
     def finished(kicked: Run) -> None:
-        kicked.summary["preset"] = called
-        replans = [replan.info for replan in kicked.execution.replans]
-        compiling, planning = (sum(getattr(info, name) for info in replans) for name in ("compile_seconds", "seconds"))
-        executing = time.perf_counter() - begin - compiling - planning
-        tell(f"compiling {compiling:.1f} s, planning {planning:.1f} s, executing {executing:.1f} s")
         with tell.part("writing"):
             kicked.save(out)
         if video is not None:
@@ -215,10 +210,16 @@ def main(
         tell.result(kicked.table, kicked.summary)
         tell(f"{out}/: summary.json, kick.npz, kick.png, kick.html")
 
-    begin = time.perf_counter()
     if not view:
+        begin = time.perf_counter()
         tell("planning and executing; what is new is compiled first")
-        finished(kick.to(goal, chosen, dynamics, weights, seed))
+        kicked = kick.to(goal, chosen, dynamics, weights, seed)
+        kicked.summary["preset"] = called
+        replans = [replan.info for replan in kicked.execution.replans]
+        compiling, planning = (sum(getattr(info, name) for info in replans) for name in ("compile_seconds", "seconds"))
+        executing = time.perf_counter() - begin - compiling - planning
+        tell(f"compiling {compiling:.1f} s, planning {planning:.1f} s, executing {executing:.1f} s")
+        finished(kicked)
         return
     tasks: dict[str, Callable[[], Task]] = {"embedded" if reference is None else reference.name: lambda: kick}
     if reference is not None:

@@ -6,6 +6,7 @@ Whoever plans never waits for who looks: the page draws by itself, and is asked 
 from __future__ import annotations
 
 import json
+import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -117,6 +118,7 @@ class Live:
         self._fitted: dict[tuple[str, str, str, str, float], Planners] = {}
         self.errors: deque[tuple[float, float]] = deque(maxlen=REMEMBERED)
         self.run: Run | None = None
+        self.recording: Recording | None = None
         self.planned_for: Wishes | None = None
         self.plans = 0
         self.kept: dict[str, Path] = {}
@@ -153,8 +155,8 @@ class Live:
         try:
             while True:
                 if ask == "kick":
-                    seen = self.page.changes
                     self.carry_out()
+                    seen = self.page.changes  # what was set meanwhile has counted
                 elif ask in ("keep", "open", "beside", "alone"):
                     self._replays(ask)
                 elif ask == "reset" or seen != self.page.changes:
@@ -167,52 +169,55 @@ class Live:
     def plan(self) -> None:
         """Plan for what is set, and show what comes of it."""
         wishes = self.page.wishes
-        task = self.task(wishes.reference)
-        if not self._ready(wishes):
+        if (task := self._ready(wishes)) is None:
             return
         planner, wanted, state = self.planners(wishes).first, self._window(task)(0), self._start(task, wishes)
         told = wanted.controls, wanted.context, wanted.weights
         plan, info = planner.step(planner.init(jax.random.key(self.seed)), state, *told, steps=wanted.steps)
         costs, states = planner.fan(plan, state, *told, steps=wanted.steps)
+        self.planned_for, self.plans = wishes, self.plans + 1
+        if not np.isfinite(info.cost):
+            self.page.tell("**No plan**: whatever was tried, the model does not know how it ends.")
+            return
         fan = states[:, :, task.ball, packed.POSITION], costs
         self.page.planned(state, info.states, fan, task.reference.states[0])
-        self.planned_for, self.plans = wishes, self.plans + 1
-        expected = nearest_approach(
-            info.states[:, task.ball, packed.POSITION], task.place(task.asked(wishes.target))
-        ).distance
+        path, place = info.states[:, task.ball, packed.POSITION], task.place(task.asked(wishes.target))
+        expected = nearest_approach(path, place).distance
         reach = "" if expected <= REACHABLE else " **Out of reach:** this plan comes nearest."
-        self.page.tell(
-            f"**Ready.** The model expects to miss by {100.0 * expected:.1f} cm, "
-            f"planned in {info.seconds:.2f} s.{reach}"
-        )
+        said = f"The model expects to miss by {100.0 * expected:.1f} cm, planned in {info.seconds:.2f} s."
+        self.page.tell(f"**Ready.** {said}{reach}")
 
     def carry_out(self) -> None:
         """Plan and kick in the truth, with the target and the weights of each moment; then play it."""
         wishes = self.page.wishes
-        task = self.task(wishes.reference)
-        if not self._ready(wishes):
+        if (task := self._ready(wishes)) is None:
             return
         world, begun = Pushed(task.scene, task.substeps), time.monotonic()
-        planners, window, shown = self.planners(wishes), self._window(task), list[Replan]()
+        planners, told = self.planners(wishes), list[Replan]()
+        goals = [wishes.target]
+
+        def window(step: int) -> Window:
+            goals.append(self.page.wishes.target)
+            return self._window(task)(step)
 
         def observe(execution: Execution) -> None:
             nonlocal begun
             step = len(execution.states) - 1
             last = task.plans(execution)[-1]
-            news = last.info.states[1:] if last.step == step - 1 else None
+            news = last.info.states if last.step == step - 1 else None
             reference = task.reference.states
             self.page.update(execution.states[-1], news, step * task.scene.dt, reference[min(step, len(reference) - 1)])
             if news is not None:
-                shown.append(last)
-                self._told(shown, wishes)
+                told.append(last)
+                self._told(told, wishes, task.scene.dt)
+            begun = max(begun + task.scene.dt / self.page.speed, time.monotonic() - task.scene.dt)
+            self.page.hold(begun)
             while (ask := self.page.asked()) is not None:
                 if ask.startswith("push "):
                     body = task.scene.bodies[-1 if ask.endswith("ball") else 0].name
                     world.waiting.append(self.page.push(body))
                 elif ask in ("reset", "kick"):
-                    raise Interrupted
-            begun = max(begun + task.scene.dt / self.page.speed, time.monotonic() - task.scene.dt)
-            self.page.hold(begun)
+                    raise Interrupted(ask)
 
         try:
             execution = task.run(
@@ -224,30 +229,37 @@ class Live:
                 world=world,
                 window=window,
             )
-        except Interrupted:
-            self.plan()
+            goal = task.asked(goals[-1])
+            said = {name: getattr(wishes, name) for name in ("preset", "dynamics", "weights")} | {"seed": self.seed}
+            self.run = Run(task, execution, goal, task.report(execution, goal) | said)
+            self.recording = self.run.recording
+        except Interrupted as ended:
+            if str(ended) == "kick":
+                self.page.ask("kick")
+            else:
+                self.plan()
             return
-        goal = task.asked(self.page.wishes.target)
-        said = {name: getattr(wishes, name) for name in ("preset", "dynamics", "weights")} | {"seed": self.seed}
-        self.run = Run(task, execution, goal, task.report(execution, goal) | said)
+        except ValueError as error:  # the world diverged, or no candidate was finite
+            self.page.tell(f"**Ended:** {error}")
+            return
         self.errors.append((self.run.truth_error_m, self.run.model_error_m))
-        self._told(shown, wishes)
-        self.page.finish(self.run.recording)
+        self._told(told, wishes, task.scene.dt)
+        self.page.finish(self.recording)
         if len(self.errors) == 1:
-            self._finished(self.run)
+            self._saved(self._finished, self.run)
 
     def file(self, kind: str, recording: Recording) -> tuple[str, bytes]:
         """A recording as a file of some kind: its name and content."""
+        name = f"{self.task(self.page.wishes.reference).name}.{kind}"
         if kind == "html":
-            return "kick.html", page_of(recording).encode()
-        path = self.folder / f".download.{kind}"
-        if kind == "png":
-            kick_picture(recording, self.run.costs if self.run else None, path)
-        else:
-            write_film(recording, path, FILM, 15.0)
-        content = path.read_bytes()
-        path.unlink()
-        return f"kick.{kind}", content
+            return name, page_of(recording).encode()
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / name
+            if kind == "png":
+                kick_picture(recording, self.run.costs if self.run and recording is self.recording else None, path)
+            else:
+                write_film(recording, path, FILM, 15.0)
+            return name, path.read_bytes()
 
     def _window(self, task: Task) -> Callable[[int], Window]:
         """What is set on the page at the moment of each plan."""
@@ -258,18 +270,27 @@ class Live:
 
         return at
 
-    def _ready(self, wishes: Wishes) -> bool:
-        """Whether there are planners for what is wished for; says so where they are new, or cannot be had."""
+    def _ready(self, wishes: Wishes) -> Task | None:
+        """The task that is wished for, its planners made; None, and a word, where they cannot be had."""
         try:
             if self._key(wishes) not in self._fitted:
                 self.page.tell("**Setting up** what is new: the first plan compiles, for some seconds.")
             self.planners(wishes)
+            return self.task(wishes.reference)
         except ValueError as error:
             self.page.tell(f"**Not possible:** {error}")
+            return None
+
+    def _saved(self, save: Callable[[Run], object], run: Run) -> bool:
+        """Whether a run could be written; says why not."""
+        try:
+            save(run)
+        except (OSError, ValueError) as error:
+            self.page.tell(f"**Not written:** {error}")
             return False
         return True
 
-    def _told(self, plans: list[Replan], wishes: Wishes) -> None:
+    def _told(self, plans: list[Replan], wishes: Wishes, dt: float) -> None:
         """Figures of the kick that runs, and of those before."""
         if not plans:
             return
@@ -278,7 +299,7 @@ class Live:
         lost = sum(info.candidates - info.finite for info in infos)
         lines = [
             f"- plans: first {infos[0].seconds:.2f} s; again {np.quantile(again, 0.5):.0f} ms (p50), "
-            f"{np.quantile(again, 0.99):.0f} ms (p99), every {10 * every} ms",
+            f"{np.quantile(again, 0.99):.0f} ms (p99), every {1e3 * dt * every:.0f} ms",
             f"- candidates lost: {lost} of {sum(info.candidates for info in infos)}",
         ]
         if self.errors:
@@ -299,15 +320,15 @@ class Live:
         page = self.page
         if ask == "keep" and self.run is not None:
             place = self.folder / time.strftime("%Y-%m-%d_%H-%M-%S")
-            self.run.save(place)
-            self._find()
-            page.tell(f"**Kept** as {place.name}.")
+            if self._saved(lambda run: run.save(place), self.run):
+                self._find()
+                page.tell(f"**Kept** as {place.name}.")
         elif ask == "alone" and page.recording is not None:
             page.finish(page.recording)
         elif (name := page.panel.chosen(list(self.kept))) is not None and ask in ("open", "beside"):
             try:
                 found = opened(self.task(page.wishes.reference), self.kept[name])
-            except (ValueError, KeyError, OSError) as error:
+            except ValueError as error:
                 page.tell(f"**Cannot be opened:** {name}: {error}")
                 return
             other = page.recording if ask == "beside" else None
@@ -321,23 +342,25 @@ class Live:
 
 
 class Interrupted(Exception):
-    """The kick that runs was asked to end."""
+    """The kick that runs was asked to end, by this name."""
 
 
 def opened(task: Task, folder: Path) -> Recording:
     """The recording of a kick that was saved. Raises ValueError where it is of another scene, or damaged."""
-    summary = json.loads((folder / "summary.json").read_text())
-    with np.load(folder / f"{task.name}.npz", allow_pickle=False) as file:
-        states, predicted, begun = (file[name] for name in ("states", "predicted_states", "plan_step"))
-    goal = task.asked(tuple(summary["target"]))
-    before = states[int(begun)][None]
+    try:
+        summary = json.loads((folder / "summary.json").read_text())
+        with np.load(folder / f"{task.name}.npz", allow_pickle=False) as file:
+            states, predicted, begun = (file[name] for name in ("states", "predicted_states", "plan_step"))
+        goal, facts, before = task.asked(tuple(summary["target"])), task.facts(summary), states[int(begun)][None]
+    except Exception as error:  # json, numpy and zipfile raise many kinds for a damaged file
+        raise ValueError(f"{folder.name} cannot be read: {type(error).__name__}: {error}") from None
     return Recording(
         task.scene,
         states,
-        goal,
+        task.place(goal),
         np.concatenate([before, predicted]),
         int(begun),
         task.reference.states[: len(states)],
         f"{task.title(goal)} ({folder.name})",
-        task.facts(summary),
+        facts,
     )

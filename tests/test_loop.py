@@ -76,6 +76,18 @@ def test_each_phase_plans_with_its_own_planners_for_its_own_links_until_it_is_ov
     np.testing.assert_array_equal(world.given[11 + HORIZON :], np.zeros((20 - 11 - HORIZON, 1, 3)))
 
 
+def test_weights_of_a_window_replace_those_of_the_terms() -> None:
+    planner, costs = _planner(), []
+    for weight in (1.0, 10.0):
+
+        def window(step: int) -> Window:
+            return _window(step)._replace(weights={"miss": weight})  # noqa: B023
+
+        (replan,) = execute(World(), START, (Phase(planner, planner, 9, window),), 1, jax.random.key(0), DT).replans
+        costs.append(replan.info.cost)
+    assert costs[1] == pytest.approx(10.0 * costs[0], rel=1e-4)
+
+
 def test_a_phase_that_lingers_carries_its_plan_on_before_the_next_begins() -> None:
     one, other = _planner(), _planner()
     phases = (

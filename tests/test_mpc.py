@@ -615,6 +615,17 @@ def test_planners_of_one_problem_share_what_is_compiled() -> None:
     assert second.cost <= info.cost
 
 
+def test_the_fan_around_a_plan_is_of_its_problem_always_the_same_and_compiles_nothing() -> None:
+    planner = _planner(optimizers=CEM(samples=16, rounds=1, elites=3))
+    plan, info = planner.step(planner.init(jax.random.key(0)), STATE, REFERENCE, TARGET)
+    costs, states = planner.fan(plan, STATE, REFERENCE, TARGET, count=12)
+    assert costs.shape == (12,) and states.shape == (12, *info.states.shape)
+    assert costs.min() >= 0.0 and np.isfinite(costs).all() and (costs != costs[0]).any()
+    again, _ = planner.fan(plan, STATE, REFERENCE, TARGET, count=12)
+    np.testing.assert_array_equal(costs, again)
+    assert planner.step(plan, STATE, REFERENCE, TARGET)[1].compile_seconds == 0
+
+
 def test_a_plan_goes_on_in_a_planner_that_keeps_more_elites_or_fewer() -> None:
     few, many = CEM(samples=16, rounds=1, elites=3), CEM(samples=32, rounds=1, elites=9)
     planner = _planner(optimizers=few)

@@ -77,7 +77,7 @@ def test_ways_to_search_are_fitted_into_the_time_measured_and_told(monkeypatch: 
         given.append(seconds)
         return scaled(preset, Seconds(0.2, 0.2, 0.2))
 
-    monkeypatch.setattr(optimizers, "within", fifth)
+    monkeypatch.setattr("tasks.task.within", fifth)
     weights = stored.SHIPPED / f"{WEIGHTS}.json"
     row = optimizers.compare(
         kick.Kick.standard(substeps=4), "Gauss-Newton, differences", weights, 0.3, targets=1, seed=0

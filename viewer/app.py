@@ -21,6 +21,7 @@ import viser
 from larp_model.scene import Scene
 from larp_model.state import POSITION
 from viewer.camera import VIEWS, View
+from viewer.checked import within
 from viewer.handles import Handles
 from viewer.panel import Panel
 from viewer.recording import Recording, known, nearest_approach
@@ -49,7 +50,8 @@ class News:
     plan_time: float = 0.0
     fan: tuple[np.ndarray, np.ndarray] | None = None
     reference: np.ndarray | None = None
-    fresh: bool = True
+    fresh: bool = True  # all of it, the plan and its fan
+    planned: bool = True
 
 
 class LivePage:
@@ -76,6 +78,7 @@ class LivePage:
         self._drawn: tuple[int, frozenset[str]] | None = None  # row of the recording that is on the page, and ghosts
         self._single = 0  # steps that may be taken although time stands still
         self._views: dict[int, tuple[str, float]] = {}  # by client: how it looks, and the aspect that this was for
+        self._filing = threading.Lock()
         self.files: Callable[[str, Recording], tuple[str, bytes]] | None = None
         self._panel = Panel(self._server.gui, self._ask, self._change, offer)
         self._server.on_client_connect(self._welcome)
@@ -94,9 +97,12 @@ class LivePage:
 
     def _ask(self, name: str, client: viser.ClientHandle | None) -> None:
         """Do at once what is the page's own, keep all else for whoever plans."""
-        if name == "step":
+        if name == "play":
+            self._panel.playing = not self._panel.playing
+        elif name == "step":
             with self._lock:
-                self._single += 1
+                self._panel.playing = False
+                self._single += self._mode == "running"
                 if self._recording is not None:
                     self._panel.move(self._recording.scene.dt)
         elif name == "weights":
@@ -106,12 +112,12 @@ class LivePage:
             with self._lock:
                 self._drawn = None
                 if self._news:
-                    self._news.fresh = True
+                    self._news.fresh = self._news.planned = True
         elif name.startswith("view ") and client is not None:
             self._look(client, name.removeprefix("view "))
         elif name.startswith("download ") and client is not None:
             self._download(client, name.removeprefix("download "))
-        elif name != "play":
+        else:
             self._asked.put(name)
         self._moved.set()
 
@@ -182,7 +188,7 @@ class LivePage:
                         self._single -= 1
                         return
                 if not self._asked.empty():
-                    return
+                    return  # it may be asked to end
                 self._closed.wait(FRAME)
         raise Stopped
 
@@ -207,14 +213,12 @@ class LivePage:
             self._stage = Stage(self._server, scene, target, traced)
             seen = np.array([(0.0, 0.0, 0.0), (0.0, 0.0, 1.8)]) if state is None else np.asarray(state)[:, POSITION]
             self._stage.frame(np.concatenate([seen, np.asarray(target, float)[None]]))
-            self._recording, self._beside, self._news, self._scene = None, None, None, scene
+            self._recording, self._beside, self._news = None, None, None
             self._mode, self._single = "waiting", 0
             if self.offer is not None:
                 assert state is not None
-                before, ball = self._handles, self._stage.lane.position(state)
+                ball = self._stage.lane.position(state)
                 self._handles = Handles(self._server, self.offer, tuple(target), ball, self._change)
-                if before is not None:
-                    self._handles.again(before)
             if state is not None:
                 self._stage.lane.show(state)
             self._panel.watch()
@@ -237,7 +241,7 @@ class LivePage:
                 self._handles.shown(True)
             self._stage.compare(None)
             self._recording, self._beside, self._mode = None, None, "planned"
-            self._news = News(np.array(state), 0.0, [], np.array(expected), 0.0, fan, reference)
+            self._news = News(np.array(state), 0.0, [], known(expected), 0.0, fan, reference)
             self._panel.watch()
 
     def update(
@@ -245,22 +249,24 @@ class LivePage:
     ) -> None:
         """The truth's state (L, 13) at `time` [s].
 
-        predicted: (H, L, 13) of the model for time + dt, time + 2 dt, ..., if just asked; otherwise None. reference:
-        state (L, 13), if it is to be seen.
+        predicted: (H, L, 13) of the model for time, time + dt, ..., if just asked; otherwise None. reference: state
+        (L, 13), if it is to be seen.
         """
         with self._lock:
             if self._stage is None:
                 raise ValueError("update came before begin, but the page needs a scene first")
             if self._mode != "running":
-                self._mode, self._recording = "running", None
-                self._news = News(np.array(state), time, fan=self._news.fan if self._news else None)
+                self._mode, self._recording, self._beside, self._single = "running", None, None, 0
+                self._news, self._panel.playing = News(np.array(state), time), True
+                self._stage.compare(None)
                 if self._handles:
+                    self._stage.lane.aim(np.array(self._handles.target))
                     self._handles.shown(False)
                 self._panel.watch()
             news = self._news
             assert news is not None
             if predicted is not None:
-                news.plan, news.plan_time = np.array(predicted), time
+                news.plan, news.plan_time, news.planned = known(predicted), time, True
             news.path.append(self._stage.lane.position(state).copy())
             news.state, news.time, news.reference, news.fresh = np.array(state), time, reference, True
 
@@ -332,7 +338,7 @@ class LivePage:
             with self._lock:
                 if self._recording is not None:
                     self._draw_recording(self._recording, now - last)
-                elif self._stage is not None and self._news is not None and self._news.fresh:
+                elif self._stage is not None and self._news is not None:
                     self._draw_news(self._stage, self._news)
             last = now
 
@@ -353,26 +359,28 @@ class LivePage:
         self._frames += 1
 
     def _draw_news(self, stage: Stage, news: News) -> None:
-        lane, plan = stage.lane, news.plan
+        """What has changed since it was last drawn; of a plan that waits, the ghost goes on moving."""
+        lane, plan, waits = stage.lane, news.plan, self._mode == "planned"
+        if not news.fresh and not (waits and self._panel.playing):
+            return
         lane.shown = self._panel.ghosts
         expected = None
         if plan is not None:
-            step = round((news.time - news.plan_time) / self._scene.dt) - 1
-            if self._mode == "planned":
-                step = int(clock.monotonic() / self._scene.dt * self._panel.speed) % len(plan)
-            expected = known(plan)[step] if 0 <= step < len(plan) else None
+            step = round((news.time - news.plan_time) / stage.scene.dt)
+            if waits:
+                step = int(clock.monotonic() / stage.scene.dt * self._panel.speed) % len(plan)
+            expected = plan[step] if 0 <= step < len(plan) else None
         lane.show(news.state, prediction=expected, reference=news.reference)
         self._frames += 1
-        path = np.array(news.path) if news.path else None
-        miss = lane.trace(path, None if plan is None else lane.position(plan))
-        if news.fan is not None and "fan" in lane.shown:
-            lane.fan(*news.fan)
-        else:
-            lane.fan(None)
-        self._follow(lane.position(news.state))
-        if self._mode == "running":
-            self._panel.write(f"**Kicking**, {news.time:.2f} s: {100.0 * miss:.1f} cm from the target\n\n{LEGEND}")
-        news.fresh = self._mode == "planned" and self._panel.playing
+        if news.fresh:
+            path = np.array(news.path) if news.path else None
+            miss = lane.trace(path, None if plan is None else lane.position(plan), news.planned)
+            if news.planned:
+                lane.fan(*(news.fan or (None, None)) if "fan" in lane.shown else (None, None))
+            if self._mode == "running" or self.offer is None:
+                self._panel.write(f"**Kicking**, {news.time:.2f} s: {100.0 * miss:.1f} cm from the target\n\n{LEGEND}")
+            self._follow(lane.position(news.state))
+        news.fresh = news.planned = False
 
     # Cameras and files, each client's own.
 
@@ -382,15 +390,15 @@ class LivePage:
         # The panel, and whoever changes the window, leave more or less of it to the picture.
         @client.camera.on_update
         async def _(camera: viser.CameraHandle) -> None:
-            view, aspect = self._views.get(client.client_id, ("", camera.aspect))
-            if abs(camera.aspect / aspect - 1.0) > 0.02:
+            view, aspect = self._views.get(client.client_id, ("", 1.0))
+            if view and abs(aspect_of(camera) / aspect - 1.0) > 0.02:
                 self._look(client, view)
 
     def _part(self, client: viser.ClientHandle) -> None:
         self._views.pop(client.client_id, None)
 
     def _look(self, client: viser.ClientHandle, view: str) -> None:
-        aspect = float(np.clip(client.camera.aspect, 0.2, 5.0))
+        aspect = aspect_of(client.camera)
         self._views[client.client_id] = view, aspect
         chosen: View | None = next((each for each in VIEWS if each == view), None)
         with self._lock:
@@ -403,20 +411,29 @@ class LivePage:
     def _follow(self, ball: np.ndarray) -> None:
         for number, client in self._server.get_clients().items():
             if self._views.get(number, ("",))[0] == "follow":
-                with client.atomic():
+                with client.atomic(), suppress(ValueError):  # of a client whose camera makes no sense
                     client.camera.position, client.camera.look_at = ball + FOLLOWED, ball
 
     def _download(self, client: viser.ClientHandle, kind: str) -> None:
         """Make a file of the recording that is played, apart from what is drawn, and hand it to one client."""
         recording, files = self._recording, self.files
-        if recording is None or files is None:
-            client.add_notification("Nothing to download yet", "Kick first.", auto_close_seconds=4.0)
+        if recording is None or files is None or not self._filing.acquire(blocking=False):
+            why = "Kick first." if recording is None else "Another file is being made."
+            client.add_notification("Not now", why, auto_close_seconds=4.0)
             return
 
         def make() -> None:
-            client.send_file_download(*files(kind, recording), save_immediately=True)
+            try:
+                client.send_file_download(*files(kind, recording), save_immediately=True)
+            finally:
+                self._filing.release()
 
         threading.Thread(target=make, daemon=True).start()
+
+
+def aspect_of(camera: viser.CameraHandle) -> float:
+    """Width over height of a client's picture, of any that makes sense."""
+    return within(camera.aspect, 0.2, 5.0)
 
 
 def described(recording: Recording) -> str:

@@ -44,10 +44,12 @@ class Handles:
 
         @handle.on_update
         async def _(event: viser.TransformControlsEvent) -> None:
+            before = self.target, self.spot, self.roll
             self._take(name, handle.position)
             if event.phase == "end":
                 self._settle()
-            self._changed()
+            if before != (self.target, self.spot, self.roll):
+                self._changed()
 
         return handle
 
@@ -103,12 +105,11 @@ class Handles:
         self._take("target", np.asarray(target, float))
         self._settle()
 
-    def again(self, before: Handles) -> None:
-        """Set all as it was with handles of before."""
-        self.target, self.spot, self.roll = before.target, before.spot, before.roll
-        self._settle()
-
     def shown(self, visible: bool) -> None:
         """Show them all, or only the target."""
         for handle in (self._spot, self._roll):
             handle.visible = visible
+        if visible:
+            self._arrow()
+        else:
+            self._server.scene.remove_by_name("/handles/rolling")

@@ -76,7 +76,7 @@ class Panel:
 
         @self._gui.add_button(label).on_click
         async def _(event: viser.GuiEvent) -> None:
-            self._ask(name, event.client)
+            self._asked(name, event.client)
 
     def _group(self, label: str, names: Mapping[str, str]) -> None:
         """Buttons in a row, each of which asks for something, by what is written on it."""
@@ -84,21 +84,14 @@ class Panel:
 
         @group.on_click
         async def _(event: viser.GuiEvent) -> None:
-            self._ask(names[option(group.value, tuple(names))], event.client)
+            self._asked(names[option(group.value, tuple(names))], event.client)
 
     def _key(self, label: str, name: str, key: str) -> None:
         """A key that asks for something by name."""
 
         @self._gui.add_command(label, hotkey=key).on_trigger  # type: ignore[arg-type]
         async def _(event: viser.CommandEvent) -> None:
-            self._ask(name, event.client)
-
-    def _ask(self, name: str, client: viser.ClientHandle | None) -> None:
-        if name == "play":
-            self.playing = not self._playing
-        elif name == "step":
-            self.playing = False
-        self._asked(name, client)
+            self._asked(name, event.client)
 
     def _setting(self, name: str, handle: Any) -> None:
         """Keep a control by name; whenever it changes, the settings have."""
@@ -155,14 +148,16 @@ class Panel:
         gui = self._gui
         with gui.add_folder("View", expand_by_default=self._offer is None):
             self._group("Camera", {name: f"view {name}" for name in (*VIEWS, "follow")})
-            self._ghosts = {name: gui.add_checkbox(f"show {name}", True) for name in GHOSTS}
+            shown = GHOSTS if self._offer else GHOSTS[:2]
+            self._ghosts = {name: gui.add_checkbox(f"show {name}", True) for name in shown}
             for handle in self._ghosts.values():
 
                 @handle.on_update
                 async def _(event: viser.GuiEvent) -> None:
                     self._asked("look", event.client)
 
-            self._group("Download", {name: f"download {name}" for name in FILES})
+            if self._offer:
+                self._group("Download", {name: f"download {name}" for name in FILES})
 
     @property
     def playing(self) -> bool:
@@ -227,7 +222,10 @@ class Panel:
         count = max((len(values) for values in series.values()), default=0)
         if count < 2:
             return
-        rows = [np.maximum(np.nan_to_num(np.asarray(values, float), posinf=LEAST), LEAST) for values in series.values()]
+        # What is not finite leaves a gap: it is no small value.
+        rows = [
+            np.where(np.isfinite(each), np.maximum(each, LEAST), np.nan) for each in map(np.asarray, series.values())
+        ]
         data = (np.arange(1.0, count + 1.0), *rows)
         if name in self._plots:
             self._plots[name].data = data

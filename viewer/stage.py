@@ -61,21 +61,24 @@ class Lane:
             for name, ghost in self._ghosts.items():
                 ghost.update(ghosts.get(name) if name in self.shown else None)
 
-    def trace(self, path: np.ndarray | None, expected: np.ndarray | None = None) -> float:
+    def trace(self, path: np.ndarray | None, expected: np.ndarray | None = None, new: bool = True) -> float:
         """Draw the paths (T, 3) of the truth and (T', 3) of the prediction [m]; None: there is none.
+
+        new: whether the prediction is; else it has been drawn.
 
         Returns how near the true one comes to the target [m], or, as long as it still comes nearer, the expected one; a
         label at the target says it in cm.
         """
         with self._server.atomic():
             self._line("truth", path, TRUTH, 0.025)
-            self._line("expected", expected, PREDICTION, 0.015)
+            if new:
+                self._line("expected", expected, PREDICTION, 0.015)
             ways = {kind: way for kind, way in (("", path), (" expected", expected)) if way is not None}
             found = {kind: nearest_approach(way, self.target) for kind, way in ways.items()}
             if not found:
                 self._label.visible = False
                 return float("inf")
-            if len(found) > 1 and found[""].row >= len(ways[""]) - 2:
+            if len(found) > 1 and np.linalg.norm(found[""].point - ways[""][-1]) < self._radius:
                 del found[""]  # it is still on its way
             kind, approach = next(iter(found.items()))
             self._line("miss", np.stack([approach.point, self.target]), TARGET, 0.012)
@@ -118,7 +121,7 @@ class Stage:
 
     def __init__(self, server: viser.ViserServer, scene: Scene, target: np.ndarray, traced: int = -1) -> None:
         """target: (3,) [m]. traced: row in the state of the link whose path is drawn."""
-        self._server, self._scene, self._traced = server, scene, traced
+        self._server, self.scene, self._traced = server, scene, traced
         with server.atomic():
             server.scene.reset()
             server.scene.set_up_direction("+z")
@@ -134,7 +137,7 @@ class Stage:
             self.beside = None
         if target is not None:
             with self._server.atomic():
-                self.beside = Lane(self._server, self._scene, "/beside", target, self._traced, aside)
+                self.beside = Lane(self._server, self.scene, "/beside", target, self._traced, aside)
         return self.beside
 
     def frame(self, points: np.ndarray) -> None:

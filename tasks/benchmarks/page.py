@@ -39,8 +39,8 @@ STAYS = 3.0
 WARM_UP = 3
 
 
-def watch(address: str, clients: int, coming: bool) -> None:
-    """Be so many clients until ended; where some are `coming`, one more comes, stays a while and leaves, on and on."""
+def watch(address: str, clients: int) -> None:
+    """Be so many clients until ended; one more comes, stays a while and leaves, on and on."""
 
     def one(number: int, seconds: float) -> None:
         end = time.monotonic() + seconds
@@ -59,9 +59,8 @@ def watch(address: str, clients: int, coming: bool) -> None:
     threads = [threading.Thread(target=one, args=(number, 1e9), daemon=True) for number in range(clients)]
     for thread in threads:
         thread.start()
-    while coming:
+    while True:
         one(0, STAYS)
-    threads[0].join()
 
 
 def until(what: Callable[[], object], seconds: float = 120.0) -> float:
@@ -136,7 +135,7 @@ def main(
         until(lambda: page.mode == "planned", 300.0)
         address = page.address.replace("http", "ws")
         spawn = multiprocessing.get_context("spawn")
-        watching = spawn.Process(target=watch, args=(address, clients, True), daemon=True)
+        watching = spawn.Process(target=watch, args=(address, clients), daemon=True)
         watching.start()
         until(lambda: len(process.net_connections("tcp")) > clients, 60.0)
         for _ in range(WARM_UP):

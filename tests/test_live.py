@@ -1,0 +1,140 @@
+"""A task on its page, without a browser: what is wished for is within what is offered, what is asked for happens."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from larp_model import state as packed
+from larp_model.bodies import human_and_ball
+from tasks.kick import Kick, wished
+from tasks.live import ROLLS, SPOTS, TARGETS, Choices, Pushed, opened, weights_for
+from tasks.presets import PRESETS
+from viewer import LivePage, Push, Stopped
+from viewer.camera import VIEWS, Camera, View
+from viewer.handles import Handles
+from viewer.recording import known
+
+SCENE = human_and_ball()
+
+
+@pytest.fixture(scope="module")
+def kick() -> Kick:
+    return Kick.standard(substeps=4)
+
+
+@pytest.fixture
+def page(kick: Kick) -> Iterator[LivePage]:
+    choices = Choices({"embedded": lambda: kick}, PRESETS, ("larp", "mujoco"), weights_for(kick, None))
+    with LivePage(port=0, offer=choices.offer(kick)) as page:
+        page.begin(kick.scene, np.array([4.0, 0.0, 0.5]), state=kick.start())
+        yield page
+
+
+def test_what_is_wished_for_at_first_is_what_is_usual(page: LivePage, kick: Kick) -> None:
+    wishes = page.wishes
+    assert wishes.target == (4.0, 0.0, 0.5) and wishes.spot == wishes.roll == (0.0, 0.0)
+    assert (wishes.preset, wishes.dynamics, wishes.weights) == (next(iter(PRESETS)), "larp", "human_ball")
+    assert dict(wishes.terms) == {term.name: term.weight for term in kick.terms}
+    np.testing.assert_array_equal(wished(kick, wishes), kick.start())
+
+
+@pytest.mark.parametrize(
+    ("name", "box"), [("target", TARGETS), ("spot", SPOTS), ("roll", ROLLS)], ids=["target", "spot", "roll"]
+)
+@pytest.mark.parametrize("place", [(1e6, -1e6, 1e6), (-1e6, 1e6, -1e6), (np.nan, np.inf, -np.inf)])
+def test_whatever_is_dragged_stays_within_what_is_offered(
+    name: str, box: tuple[tuple[float, ...], ...], place: tuple[float, ...], page: LivePage
+) -> None:
+    handles = page._handles
+    assert isinstance(handles, Handles)
+    handles._take(name, np.array(place))
+    found = np.array(getattr(page.wishes, name))
+    assert (found >= np.array(box[0]) - 1e-12).all() and (found <= np.array(box[1]) + 1e-12).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1.0, 1e9, "much", None])
+def test_whatever_a_client_sends_weights_stay_within_what_is_offered(value: object, page: LivePage) -> None:
+    page.panel._terms["effort"]._impl.value = value
+    assert 0.0 <= page.wishes.terms["effort"] <= 5.0 * 0.5
+
+
+def test_a_drag_is_a_change_and_what_is_asked_for_is_handed_on_in_order(page: LivePage) -> None:
+    changes = page.changes
+    page.aim(np.array([3.0, 0.5, 0.4]))
+    assert page.changes == changes + 1 and page.wishes.target == (3.0, 0.5, 0.4)
+    page.ask("kick")
+    page.ask("push ball")
+    assert [page.asked(), page.asked(), page.asked()] == ["kick", "push ball", None]
+    page.close()
+    with pytest.raises(Stopped):
+        page.asked(10.0)
+
+
+def test_time_that_stands_still_holds_whoever_kicks_until_a_step_is_asked_for(page: LivePage, kick: Kick) -> None:
+    page.hold(0.0)
+    page.update(kick.start(), None, 0.0)
+    page.ask("play")
+    assert not page.playing
+    held = threading.Thread(target=page.hold, args=(0.0,))
+    held.start()
+    held.join(0.2)
+    assert held.is_alive()
+    page.ask("step")
+    held.join(5.0)
+    assert not held.is_alive()
+    page.close()
+    with pytest.raises(Stopped):
+        page.hold(0.0)
+
+
+def test_a_push_changes_the_velocity_of_its_body_alone(kick: Kick) -> None:
+    start, control = kick.start(), kick.reference.controls[:1]
+    usual, pushed = Pushed(kick.scene, 4), Pushed(kick.scene, 4)
+    for world in (usual, pushed):
+        world.reset(start[None])
+    pushed.waiting.append(Push("ball", (0.0, 2.0, 1.0)))
+    apart = (pushed.step(control) - usual.step(control))[0, :, packed.VELOCITY]
+    np.testing.assert_allclose(apart[-1, 1:], (2.0, 1.0), atol=0.15)
+    assert abs(apart[:-1]).max() < 1e-6 and not pushed.waiting
+
+
+def test_weights_of_other_scenes_are_not_offered(kick: Kick) -> None:
+    assert list(weights_for(kick, None)) == ["human_ball", "any_human"]
+
+
+def test_a_kept_kick_of_another_scene_or_damaged_is_refused(kick: Kick, tmp_path: Path) -> None:
+    summary = {"target": [4.0, 0.0, 0.5]}
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    for damage in (lambda path: None, lambda path: path.write_bytes(b"PK"), other_scene):
+        damage(tmp_path / "kick.npz")
+        with pytest.raises(ValueError, match=r"cannot be read|has shape"):
+            opened(kick, tmp_path)
+
+
+def other_scene(path: Path) -> None:
+    np.savez(path, states=np.zeros((3, 2, 13)), predicted_states=np.zeros((2, 2, 13)), plan_step=0)
+
+
+def test_a_prediction_is_shown_as_far_as_it_was_worked_out() -> None:
+    states = np.zeros((6, len(SCENE.links), 13))
+    states[:, :, 0] = np.minimum(np.arange(6), 3)[:, None]
+    states[:, -1, 0] = np.arange(6)
+    found = known(states)
+    assert np.isfinite(found[:4]).all() and np.isfinite(found[:, -1]).all()
+    assert np.isnan(found[4:, :-1]).all()
+
+
+@given(st.sampled_from(VIEWS), st.floats(0.3, 3.0), st.integers(0, 100))
+def test_every_view_has_all_that_matters_in_its_picture(view: View, aspect: float, seed: int) -> None:
+    points = np.random.default_rng(seed).uniform(-2.0, 4.0, (20, 3))
+    camera = Camera.of(points, 1.0 / aspect, view, 0.4 * aspect)
+    found = np.abs(camera(points)) / (1.0, 1.0 / aspect)
+    assert (camera.depth(points) > 0.0).all() and found.max() == pytest.approx(1.0, abs=1e-6)
