@@ -15,12 +15,10 @@ from larp_model.scene import Scene
 from larp_model.truth.episodes import Episodes
 from tasks.data import WINDOWS, random_episodes
 from tasks.motions import references
-from tasks.motions.generator import STRIKES, any_episodes
+from tasks.motions.generator import any_episodes
 from tasks.thrown import thrown_episodes
 
 CHAIN_WINDOWS = (10, 40, 80, 190)
-# Steps of an episode of the strike alone.
-STRIKE = 14
 # The scenarios, and the weights, of humans of every size in any motion.
 ANY_HUMAN: dict[Detail, str] = {"lean": "any_human", "full": "full_human"}
 
@@ -31,7 +29,7 @@ class Scenario:
 
     draw: episodes from (count, seed), and how many more diverged. windows: the first n steps over which errors are
     averaged. strikes: a human meets what lies there; `data.contact_episodes` are worth drawing besides. paper: mean
-    position error [m] over the windows, by body. strike: short episodes of the strike alone, from (count, seed).
+    position error [m] over the windows, by body.
     """
 
     name: str
@@ -40,7 +38,6 @@ class Scenario:
     windows: tuple[int, ...]
     strikes: bool = False
     paper: tuple[tuple[str, tuple[float, ...]], ...] = ()
-    strike: Callable[[int, int], tuple[Episodes, int]] | None = None
 
 
 def _kicking(scene: Scene) -> Scene:
@@ -60,18 +57,12 @@ def _any_human(scene: Scene, count: int, seed: int) -> tuple[Episodes, int]:
     return any_episodes(scene, _embedded(scene), count, seed)
 
 
-def _any_strike(scene: Scene, count: int, seed: int) -> tuple[Episodes, int]:
-    return any_episodes(scene, _embedded(scene), count, seed, STRIKE, STRIKES)
-
-
 def _human(name: str, scene: Scene, *paper: tuple[str, tuple[float, ...]]) -> Scenario:
     return Scenario(name, scene, partial(_around_the_kick, scene), WINDOWS, bool(scene.between.pairs), paper)
 
 
 def _any(name: str, scene: Scene) -> Scenario:
-    return Scenario(
-        name, scene, partial(_any_human, scene), WINDOWS, strikes=True, strike=partial(_any_strike, scene)
-    )
+    return Scenario(name, scene, partial(_any_human, scene), WINDOWS, strikes=True)
 
 
 def _thrown(name: str, scene: Scene, *paper: float, varied: bool = True) -> Scenario:

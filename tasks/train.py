@@ -42,8 +42,8 @@ from tasks.presets import Preset
 from tasks.scenarios import Scenario, scenario, trained_at
 
 EVALUATION_SEED = 1
-# For each long episode so many short ones of impacts it has, disturbed, and of other strikes.
-CONTACTS, STRIKES = 3, 8
+# Short episodes of impacts for each long one.
+CONTACTS = 3
 # How the planner searches for the candidates that it is trained on: by sampling, for a step by gradients tries few.
 CANDIDATES = Preset((CEM(256, 10, 24, 1.0),), (CEM(128, 3, 24, 1.0),), every=4)
 # Errors of a velocity count linearly: the median launch matters, not the worst.
@@ -81,14 +81,11 @@ RESPONSES = replace(IMPACTS, updates=8000, only=RESPONSE, loss=PRECISE)
 OVER_MECHANICS = replace(
     STEPS, updates=10000, contact_share=0.4, before_contact=5, loss=LOSS._replace(far=0.005, fast=0.02)
 )
-MET = ("random", "contacts")
-GENERAL = (Stage("steps", "", OVER_MECHANICS, MET),)
+GENERAL = (Stage("steps", "", OVER_MECHANICS),)
 # A struck ball is its launch, and nothing blurs that; what else is struck is a body like others, whose response counts
 # like the push.
-STRIKING_BALLS = (*GENERAL, Stage("impacts", "", IMPACTS, MET))
-STRIKING = (*GENERAL, Stage("impacts", "", replace(IMPACTS, only=("contact", "response"), loss=LOSS), MET))
-# Impacts are learned from different strikes: from a few thousand, however disturbed, weights learn those few.
-STRUCK = (Stage("strikes", "", replace(IMPACTS, contact_share=1.0), ("random", "strikes")),)
+STRIKING_BALLS = (*GENERAL, Stage("impacts", "", IMPACTS))
+STRIKING = (*GENERAL, Stage("impacts", "", replace(IMPACTS, only=("contact", "response"), loss=LOSS)))
 # One leg on the other, the body's own motion left as it is.
 LEGS = (
     Stage(
@@ -120,7 +117,6 @@ def stages_of(chosen: Scenario) -> tuple[Stage, ...]:
     balls = any(scene.body(pair.second).is_ball for pair in scene.pairs)
     return (
         *(STRIKING_BALLS if balls else STRIKING),
-        *(STRUCK if chosen.strike else ()),
         *(LEGS if scene.within.pairs else ()),
     )
 
@@ -229,8 +225,6 @@ def main(
     done = {each["stage"] for each in rounds}
     if chosen.strikes and any("contacts".startswith(stage.uses) for stage in stages if stage.name not in done):
         add("contacts", partial(contact_episodes, chosen.scene, random, CONTACTS * episodes, seed + 1))
-    if chosen.strike and any("strikes".startswith(stage.uses) for stage in stages if stage.name not in done):
-        add("strikes", partial(chosen.strike, STRIKES * episodes, seed + 2))
     manifest = Path()
 
     def save(into: Path, recipe: dict[str, Any]) -> Path:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -19,49 +17,29 @@ from tasks.motions.details import in_detail
 from tasks.motions.people import random_people
 from tasks.motions.references import Reference, clearance, standing_on_ground
 
+# Shares of kicks and of walks; the rest moves from pose to pose.
+KICKS, GAITS = 0.45, 0.3
+# Kicks begin anywhere in the first steps of the reference.
+BEGUN = 120
 # Engine steps that are enough to see where a foot will pass.
 COARSE = 5
 
 
-class Mix(NamedTuple):
-    """What episodes are drawn.
-
-    kicks, gaits: their shares; the rest moves from pose to pose. whole: share of the kicks that begin with the
-    reference; the others begin in a step of it from begun[0] to begun[1]. faster: share of the episodes in which what
-    is struck waits for the faster foot, not for either. alike: so many in a row are of one body, for building a body's
-    engine model costs as much as a few steps.
-    """
-
-    kicks: float = 0.45
-    gaits: float = 0.3
-    whole: float = 0.4
-    begun: tuple[int, int] = (0, 120)
-    faster: float = 0.0
-    alike: int = 1
-
-
-USUAL = Mix()
-# Of the strike alone, in short episodes: the leg is on its way already.
-STRIKES = Mix(kicks=0.75, gaits=0.15, whole=0.0, begun=(12, 32), faster=0.75, alike=8)
-
-
-def any_episodes(
-    scene: Scene, reference: Reference, count: int, seed: int, steps: int = STEPS, mix: Mix = USUAL
-) -> tuple[Episodes, int]:
+def any_episodes(scene: Scene, reference: Reference, count: int, seed: int, steps: int = STEPS) -> tuple[Episodes, int]:
     """Episodes of humans of every size in motion, under their targets plus smooth noise; some with pushes from outside.
 
     What the human may strike, if anything, waits where a foot will pass, or comes from anywhere. Returns
     them, and how many were dropped because they began with one leg in the other, or diverged.
     """
     random = np.random.default_rng(seed)
-    sizes = np.repeat(random_people(random, scene, -(-count // mix.alike)), mix.alike, axis=0)[:count]
-    states, targets = in_motion(random, scene, reference, sizes, steps, mix)
+    sizes = random_people(random, scene, count)
+    states, targets = in_motion(random, scene, reference, sizes, steps)
     noise = smooth_noise(random, count, steps, 8, stray(scene))
     targets += random.uniform(0.0, 1.2, (count, 1, 1, 1)) * noise
     targets = np.clip(targets, *styles.limits(scene.body("human")))
     for pair in scene.between.pairs:
         struck = scene.index(pair.second, pair.second_links[0])
-        paths = feet(random, scene, states, targets, sizes, mix.faster)
+        paths = feet(random, scene, states, targets, sizes)
         middle = paths[:, steps // 2, :2]
         states[:, struck] = random_places(random, scene.links[struck], middle, paths, scene.dt)
         states = out_of_legs(scene, states, sizes)
@@ -75,7 +53,7 @@ def any_episodes(
 
 
 def in_motion(
-    random: np.random.Generator, scene: Scene, reference: Reference, sizes: np.ndarray, steps: int, mix: Mix = USUAL
+    random: np.random.Generator, scene: Scene, reference: Reference, sizes: np.ndarray, steps: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """States (N, L, 13) of humans of sizes (N, L, 3) in motion, and joint targets (N, steps, J, 3) [rad] to go on with.
 
@@ -83,8 +61,8 @@ def in_motion(
     other one is mirrored. What is struck is far away.
     """
     human, rows, count = scene.body("human"), scene.rows("human"), len(sizes)
-    kicking, walking = round(mix.kicks * count), round(mix.gaits * count)
-    begin = np.where(random.random(kicking) < mix.whole, 0, random.integers(*mix.begun, kicking))
+    kicking, walking = round(KICKS * count), round(GAITS * count)
+    begin = np.where(random.random(kicking) < 0.4, 0, random.integers(0, BEGUN, kicking))
     usual = bodies.human()
     performed = (
         styles.kicks(random, usual, begin, steps, scene.dt),
@@ -152,10 +130,11 @@ def planted(random: np.random.Generator, human: Body, states: np.ndarray) -> np.
 
 
 def feet(
-    random: np.random.Generator, scene: Scene, states: np.ndarray, targets: np.ndarray, sizes: np.ndarray, faster: float
+    random: np.random.Generator, scene: Scene, states: np.ndarray, targets: np.ndarray, sizes: np.ndarray
 ) -> np.ndarray:
-    """Where (N, T, 3) [m] one of a human's feet goes, in a first coarse look: either, or the faster one (a share)."""
-    either = np.array([scene.index("human", f"{side}_foot") for side in ("left", "right")])
+    """Where (N, T, 3) [m] one of either human's feet goes, in a first coarse look."""
+    names = np.where(random.random(len(states)) < 0.5, "left_foot", "right_foot")
+    rows = np.array([scene.index("human", str(name)) for name in names])
     alone = scene.only("human")
     own, first = scene.rows("human"), []
     truth = Truth(alone, 256, COARSE)
@@ -163,11 +142,6 @@ def feet(
         chosen = np.minimum(np.arange(start, start + truth.batch), len(states) - 1)
         truth.resize(sizes[chosen][:, own])
         first.append(truth.rollout(states[chosen][:, own], targets[chosen])[0])
-    both = np.concatenate(first)[: len(states), :, either - own.start, :3]
-    still = ~np.isfinite(both).all(axis=(1, 2, 3))
-    both[still] = states[still][:, None, either, :3]
-    chosen = (random.random(len(states)) >= 0.5).astype(int)
-    if faster:
-        fastest = np.linalg.norm(np.diff(both, axis=1), axis=-1).max(axis=1).argmax(axis=-1)
-        chosen = np.where(random.random(len(states)) < faster, fastest, chosen)
-    return both[np.arange(len(states)), :, chosen]
+    paths = np.concatenate(first)[: len(states)]
+    paths = paths[np.arange(len(states)), :, rows - own.start, :3]
+    return np.where(np.isfinite(paths).all(axis=(1, 2), keepdims=True), paths, states[:, rows[0], None, :3])
