@@ -30,6 +30,8 @@ from viewer.stage import LEGEND, Stage, whole
 from viewer.wishes import Offer, Push, Wishes
 
 FRAME = 1.0 / 30.0  # s
+# So many clients are drawn for at that pace; more share what time there is, for each takes the planner some.
+AT_FULL_PACE = 3
 FOLLOWED = (-2.2, -3.2, 1.4)  # m, from the ball to a camera that follows it
 
 Mode = Literal["waiting", "planned", "running", "replay"]
@@ -333,7 +335,7 @@ class LivePage:
 
     def _draw(self) -> None:
         last = clock.monotonic()
-        while not self._closed.wait(FRAME):
+        while not self._closed.wait(FRAME * max(1.0, len(self._views) / AT_FULL_PACE)):
             now = clock.monotonic()
             with self._lock:
                 if self._recording is not None:
