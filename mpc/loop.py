@@ -48,8 +48,9 @@ class Phase(NamedTuple):
 
     first: the planner of its first plan; again: of all later ones, every `every` steps. Both share horizon and knots.
     window: what is wanted from a step on. over: whether, in a step with a state (L, 13), the phase comes to its
-    end: for `linger` steps its plan is carried on, then the next phase begins or, after the last, planning ends. links:
-    those that the planners' dynamics know.
+    end: for `linger` steps its plan is carried on, then the next phase begins or, after the last, planning ends. A
+    phase whose first planner is the one before's `again` goes on with its plan. links: those that the planners'
+    dynamics know.
     """
 
     first: Planner
@@ -107,7 +108,9 @@ def execute(
                 ends = step + phases[index].linger
             if ends is None or step < ends:
                 break
-            index, plan, ends = index + 1, None, None
+            if phases[index + 1 :] and phases[index + 1].first is not phases[index].again:
+                plan = None
+            index, ends = index + 1, None
         phase = phases[min(index, len(phases) - 1)]
         if index < len(phases) and (plan is None or (ends is None and step - planned_at >= phase.every)):
             planner = phase.first if plan is None else phase.again

@@ -202,12 +202,12 @@ def main(
     called = " ".join((preset, *change))
 
     def finished(kicked: Run) -> None:
+        tell.result(kicked.table, kicked.summary)
         with tell.part("writing"):
             kicked.save(out)
         if video is not None:
             with tell.part(f"filming {video}"):
                 write_film(kicked.recording, video)
-        tell.result(kicked.table, kicked.summary)
         tell(f"{out}/: summary.json, kick.npz, kick.png, kick.html")
 
     if not view:

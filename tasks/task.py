@@ -53,9 +53,10 @@ SHORTEST = 15
 # Spread of a first plan, as a share of how far the training data strays from the reference.
 SEARCH = 0.5
 KNOTS = 9
-# Steps for which an execution goes on after the strike, and how often the plan that keeps the human up is made anew.
+# Steps for which an execution goes on after the strike.
 AFTER_CONTACT = 200
-STAND_EVERY = 4
+# Steps between the plans that keep the human up, until so many after the strike, and from then on.
+CATCH_EVERY, CATCH, STAND_EVERY = 4, 70, 12
 REACHABLE = 0.25
 # Of the human whom the shipped weights know best [m, kg].
 HEIGHT, MASS = 1.75, 70.0
@@ -342,7 +343,11 @@ class Task(ABC):
         phases = [Phase(first, again, every, window or self.window(goal), self.over(state, steps), LINGER)]
         if stands:
             standing = Standing(self.scene, self.reference)
-            phases.append(Phase(stand, stand, STAND_EVERY, standing.window, links=self.human))
+            caught = self.reference.strike + CATCH
+            phases += [
+                Phase(stand, stand, CATCH_EVERY, standing.window, lambda step, state: step >= caught, links=self.human),
+                Phase(stand, stand, STAND_EVERY, standing.window, links=self.human),
+            ]
         return execute(
             world or Truth(self.scene, 1, self.substeps, threads=1),
             state,

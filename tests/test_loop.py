@@ -101,6 +101,18 @@ def test_a_phase_that_lingers_carries_its_plan_on_before_the_next_begins() -> No
     np.testing.assert_array_equal(world.given[4:8], one.controls(last, np.zeros((HORIZON, 1, 3)))[:4])
 
 
+def test_a_phase_with_the_planner_of_the_one_before_goes_on_with_its_plan() -> None:
+    one = _planner()
+    ends = [lambda step, state: step == 6, lambda step, state: False]
+    phases = [Phase(one, one, every, _window, over) for every, over in zip((2, 5), ends, strict=True)]
+    execution = execute(World(), START, phases, 20, jax.random.key(0), DT)
+    assert [(replan.step, replan.phase) for replan in execution.replans] == [
+        (0, 0), (2, 0), (4, 0), (9, 1), (14, 1), (19, 1),
+    ]  # fmt: skip
+    alone = execute(World(), START, phases[:1], 6, jax.random.key(0), DT)
+    np.testing.assert_array_equal(execution.states[:7], alone.states)
+
+
 def test_planners_see_what_is_sensed_and_the_truth_goes_on_from_the_truth() -> None:
     planner = _planner()
     shift = np.zeros((2, 13))

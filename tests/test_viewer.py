@@ -14,15 +14,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.image import imread
+from scipy.spatial.transform import Rotation
 
 from larp_model.bodies import human_and_ball
-from larp_model.scene import Vector
 from larp_model.state import ORIENTATION, POSITION, VELOCITY
 from viewer import LivePage, Recording, check_film, kick_picture, nearest_approach, write_film, write_html
 from viewer.camera import Camera
 from viewer.film import frames
 from viewer.panel import Panel
-from viewer.scene_view import Mesh, capsule_mesh, football_meshes
+from viewer.scene_view import Mesh, SceneView, football_meshes, unit_meshes
 
 SCENE = human_and_ball()
 
@@ -52,22 +52,44 @@ def volume(*meshes: Mesh) -> float:
     return sum(float(np.linalg.det(vertices[faces].astype(float)).sum()) / 6.0 for vertices, faces in meshes)
 
 
-@pytest.mark.parametrize("axis", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.6, 0.0, -0.8)])
-@pytest.mark.parametrize(("length", "radius"), [(0.4, 0.05), (0.1, 0.2), (0.0, 0.11)])
-def test_capsule_has_its_size(length: float, radius: float, axis: Vector) -> None:
-    vertices, faces = capsule_mesh(length, radius, axis)
-    exact = np.pi * radius**2 * (length + 4.0 / 3.0 * radius)
-    assert 0.97 * exact < volume((vertices, faces)) < exact
-    reach = 0.5 * length * np.abs(axis) + radius
-    np.testing.assert_array_less(np.abs(vertices).max(axis=0), reach + 1e-6)
-    assert np.ptp(vertices @ np.array(axis)) == pytest.approx(length + 2.0 * radius, rel=1e-5)
-    assert np.abs(vertices.mean(axis=0)).max() < 1e-6
-
-
-def test_capsule_is_watertight() -> None:
-    _, faces = capsule_mesh(0.3, 0.05)
+def test_capsules_are_made_of_a_ball_and_a_tube_of_their_size() -> None:
+    (ball, faces), (tube, sides) = unit_meshes()
+    assert 0.97 < volume((ball, faces)) / (4.0 / 3.0 * np.pi) < 1.0
+    np.testing.assert_allclose(np.linalg.norm(ball, axis=1), 1.0, rtol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(tube[:, :2], axis=1), 1.0, rtol=1e-6)
+    np.testing.assert_allclose(np.abs(tube[:, 2]), 0.5)
+    outwards = np.cross(tube[sides[:, 1]] - tube[sides[:, 0]], tube[sides[:, 2]] - tube[sides[:, 0]])
+    assert ((outwards * tube[sides[:, 0]]).sum(axis=-1) > 0.0).all()
     edges = {(int(a), int(b)) for face in faces for a, b in zip(face, np.roll(face, -1), strict=True)}
     assert len(edges) == 3 * len(faces) and all((b, a) in edges for a, b in edges)
+
+
+def test_capsules_are_drawn_where_their_links_are_and_unknown_ones_shrink_to_nothing(page: LivePage) -> None:
+    scene, random = human_and_ball(), np.random.default_rng(3)
+    state = random.standard_normal((len(scene.links), 13))
+    state[:, ORIENTATION] /= np.linalg.norm(state[:, ORIENTATION], axis=-1, keepdims=True)
+    state[2] = np.nan
+    view = SceneView(page._server, scene, "/drawn")
+    view.update(state)
+    capsules = view.capsules
+    assert capsules is not None
+    ends_sizes, tube_sizes = capsules.ends.batched_scales, capsules.tubes.batched_scales
+    assert ends_sizes is not None and tube_sizes is not None
+    links = len(scene.body("human").links)
+    for row, link in enumerate(scene.body("human").links):
+        ends, tube = ends_sizes[[row, row + links]], tube_sizes[row]
+        if row == 2:
+            assert not ends.any() and not tube.any()
+            continue
+        np.testing.assert_allclose(ends, link.radius, rtol=1e-6)
+        np.testing.assert_allclose(tube, (link.radius, link.radius, link.length), rtol=1e-6)
+        turned = Rotation.from_quat(state[row, ORIENTATION], scalar_first=True)
+        reach = turned.apply(0.5 * link.length * np.array(link.axis))
+        places = state[row, POSITION] + np.array([-1.0, 1.0])[:, None] * reach
+        np.testing.assert_allclose(capsules.ends.batched_positions[[row, row + links]], places, atol=1e-6)
+        np.testing.assert_allclose(capsules.tubes.batched_positions[row], state[row, POSITION], atol=1e-6)
+        along = Rotation.from_quat(capsules.tubes.batched_wxyzs[row], scalar_first=True).apply((0.0, 0.0, link.length))
+        np.testing.assert_allclose(along, 2.0 * reach, atol=1e-6)
 
 
 def test_football_is_a_sphere_of_two_colours() -> None:

@@ -8,10 +8,10 @@ from itertools import combinations
 
 import numpy as np
 import viser
-from trimesh.creation import capsule
-from trimesh.geometry import align_vectors
+from scipy.spatial.transform import Rotation
+from trimesh.creation import revolve, uv_sphere
 
-from larp_model.scene import Link, Scene, Vector
+from larp_model.scene import Link, Scene
 from larp_model.state import ORIENTATION, POSITION, SIZE
 
 Colour = tuple[int, int, int]
@@ -37,10 +37,13 @@ def weld(triangles: np.ndarray) -> Mesh:
     return vertices.astype(np.float32), faces[distinct].astype(np.uint32)
 
 
-def capsule_mesh(length: float, radius: float, axis: Vector = (0.0, 0.0, 1.0), sides: int = 32) -> Mesh:
-    """A capsule at the origin; length [m] between its hemispheres' centres, 0 makes a ball; radius [m]."""
-    upright = capsule(length, radius, count=(sides // 2, sides), transform=align_vectors((0.0, 0.0, 1.0), axis))
-    return upright.vertices.astype(np.float32), upright.faces.astype(np.uint32)
+@cache
+def unit_meshes(sides: int = 24) -> tuple[Mesh, Mesh]:
+    """A ball of radius 1 m, and an open tube along z of radius and length 1 m: scaled and joined, any capsule."""
+    ball = uv_sphere(1.0, count=(sides // 2, sides))
+    tube = revolve(np.array([(1.0, -0.5), (1.0, 0.5)]), sections=sides)
+    as_mesh = [(each.vertices.astype(np.float32), each.faces.astype(np.uint32)) for each in (ball, tube)]
+    return as_mesh[0], as_mesh[1]
 
 
 @cache
@@ -71,6 +74,56 @@ def football_meshes(radius: float, subdivisions: int = 3) -> tuple[Mesh, Mesh]:
     return sphere(hexagons), sphere(pentagons)
 
 
+class Capsules:
+    """Links as capsules, two balls and a tube each: all balls are one node of Viser's tree, all tubes another.
+
+    With nodes of their own they would be dozens of messages a picture, whose time is taken from whoever plans.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        links: Sequence[Link],
+        name: str,
+        colours: Sequence[Colour],
+        opacity: float | None,
+    ) -> None:
+        """name: in Viser's tree. colours: of each link. opacity: in (0, 1), or None."""
+        radii = np.array([link.radius for link in links])
+        self._to_end = np.array([0.5 * link.length * np.array(link.axis) for link in links])
+        self._along = Rotation.concatenate([Rotation.align_vectors(link.axis, (0.0, 0.0, 1.0))[0] for link in links])
+        self._sizes = np.stack([radii, radii, [link.length for link in links]], axis=-1)
+
+        def batch(kind: str, mesh: Mesh, sizes: np.ndarray, colours: np.ndarray) -> viser.BatchedMeshHandle:
+            return server.scene.add_batched_meshes_simple(
+                f"{name}/{kind}",
+                *mesh,
+                np.tile((1.0, 0.0, 0.0, 0.0), (len(sizes), 1)),
+                np.zeros((len(sizes), 3)),
+                batched_scales=sizes,
+                batched_colors=colours,
+                lod="off",
+                opacity=opacity,
+                cast_shadow=opacity is None,
+            )
+
+        (ball, tube), painted = unit_meshes(), np.array(colours, np.uint8)
+        self.ends = batch("ends", ball, np.tile(radii, 2), np.tile(painted, (2, 1)))
+        self.tubes = batch("tubes", tube, self._sizes, painted)
+
+    def move(self, state: np.ndarray) -> None:
+        """To a state (n, 13); those that are not known (NaN) shrink to nothing."""
+        known = np.isfinite(state).all(axis=1)
+        state = np.where(known[:, None], state, np.arange(SIZE) == ORIENTATION.start)
+        place, turned = state[:, POSITION], Rotation.from_quat(state[:, ORIENTATION], scalar_first=True)
+        to_end = turned.apply(self._to_end)
+        self.ends.batched_positions = np.concatenate([place - to_end, place + to_end])
+        self.ends.batched_scales = np.tile(known * self._sizes[:, 0], 2)
+        self.tubes.batched_positions = place
+        self.tubes.batched_wxyzs = (turned * self._along).as_quat(scalar_first=True)
+        self.tubes.batched_scales = known[:, None] * self._sizes
+
+
 class SceneView:
     """All links of a scene, drawn under one name."""
 
@@ -83,35 +136,36 @@ class SceneView:
         opacity: float | None = None,
     ) -> None:
         """name: in Viser's tree. colour: one for all links, not their own. opacity: in (0, 1), or None."""
-        self._server = server
+        self._server, self._links = server, len(scene.links)
         self._root = server.scene.add_frame(name, show_axes=False)
-        self._links = []
+        self._balls = {}
         for body in scene.bodies:
-            for link in body.links:
-                place = f"{name}/{body.name}/{link.name}"
-                self._links.append(server.scene.add_frame(place, show_axes=False))
-                meshes = [capsule_mesh(link.length, link.radius, link.axis)]
-                colours = [colour or link_colour(link)]
-                if body.is_ball and colour is None:
-                    meshes, colours = list(football_meshes(link.radius)), list(BALL_PATCHES)
-                for part, ((vertices, faces), own) in enumerate(zip(meshes, colours, strict=True)):
+            if body.is_ball:
+                place, radius = f"{name}/{body.name}", body.links[0].radius
+                self._balls[scene.rows(body.name).start] = server.scene.add_frame(place, show_axes=False)
+                vertices, faces = unit_meshes()[0]
+                meshes = ((radius * vertices, faces),) if colour else football_meshes(radius)
+                for part, (mesh, own) in enumerate(zip(meshes, (colour,) if colour else BALL_PATCHES, strict=True)):
                     server.scene.add_mesh_simple(
-                        f"{place}/{part}",
-                        vertices,
-                        faces,
-                        color=own,
-                        opacity=opacity,
-                        cast_shadow=opacity is None,
+                        f"{place}/{part}", *mesh, color=own, opacity=opacity, cast_shadow=opacity is None
                     )
+        self._rows = np.array([row for row in range(self._links) if row not in self._balls], int)
+        links = [scene.links[row] for row in self._rows]
+        colours = [colour or link_colour(link) for link in links]
+        self.capsules = Capsules(server, links, f"{name}/capsules", colours, opacity) if links else None
 
     def update(self, state: np.ndarray | None) -> None:
         """Move the links to a state (L, 13); hide those whose state is not known (NaN), or all if it is None."""
-        if state is not None and np.shape(state) != (len(self._links), SIZE):
-            raise ValueError(f"state has shape {np.shape(state)}, but needs ({len(self._links)}, {SIZE})")
+        if state is not None and np.shape(state) != (self._links, SIZE):
+            raise ValueError(f"state has shape {np.shape(state)}, but needs ({self._links}, {SIZE})")
         with self._server.atomic():
             self._root.visible = state is not None
-            if state is not None:
-                for link, row in zip(self._links, np.asarray(state, float), strict=True):
-                    link.visible = bool(np.isfinite(row).all())
-                    if link.visible:
-                        link.position, link.wxyz = row[POSITION], row[ORIENTATION]
+            if state is None:
+                return
+            state = np.asarray(state, float)
+            for row, ball in self._balls.items():
+                ball.visible = bool(np.isfinite(state[row]).all())
+                if ball.visible:
+                    ball.position, ball.wxyz = state[row, POSITION], state[row, ORIENTATION]
+            if self.capsules:
+                self.capsules.move(state[self._rows])
