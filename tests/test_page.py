@@ -17,6 +17,7 @@ import pytest
 import viser
 from matplotlib.image import imread
 
+from larp_model import weights as stored
 from mpc import CEM
 from tasks.kick import Kick, wished
 from tasks.live import Choices, Live
@@ -65,9 +66,9 @@ def planned_for(served: Served) -> Wishes:
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     task = Kick.standard(substeps=4)
-    choices = Choices(
-        {"embedded": lambda: task}, {"quick": QUICK, "other": OTHER}, ("mujoco", "larp"), {"usual": task.weights}
-    )
+    tasks = {"embedded": lambda: task, "another": lambda: Kick.standard(substeps=4)}
+    weights = {"usual": task.weights, "any human": stored.SHIPPED / "any_human.json"}
+    choices = Choices(tasks, {"quick": QUICK, "other": OTHER}, ("mujoco", "larp"), weights)
     with LivePage(port=0, offer=choices.offer(task)) as page:
         live = Live(page, choices, TARGET, tmp_path_factory.mktemp("kept"), start=wished)
         thread = threading.Thread(target=live.serve)
@@ -136,14 +137,14 @@ def placed(seen: Page, served: Served, point: np.ndarray) -> tuple[float, float]
     return middle[0] + 0.5 * box["width"] * across, middle[1] - 0.5 * box["width"] * up
 
 
-def drag(seen: Page, place: tuple[float, float], up: int = 40) -> None:
-    """Drag what is there upwards, as slowly as the page can follow."""
+def drag(seen: Page, place: tuple[float, float], right: int = 0, up: int = 0) -> None:
+    """Drag what is there by so many pixels, as slowly as the page can follow."""
     x, y = place
     seen.mouse.move(x, y)
     time.sleep(0.5)
     seen.mouse.down()
     for share in range(9):
-        seen.mouse.move(x, y - up * share / 8)
+        seen.mouse.move(x + right * share / 8, y - up * share / 8)
         time.sleep(0.1)
     seen.mouse.up()
 
@@ -185,7 +186,7 @@ def test_what_is_dragged_changes_the_plan(seen: Page, served: Served) -> None:
     time.sleep(2.0)
     before, plans = served.page.wishes.target, served.live.plans
     # The arrow that points up is one of few things whose place in the picture is known: above the target.
-    drag(seen, placed(seen, served, np.add(before, (0.0, 0.0, 0.25))))
+    drag(seen, placed(seen, served, np.add(before, (0.0, 0.0, 0.25))), up=40)
     until(lambda: served.page.wishes.target != before)
     assert served.page.wishes.target[2] > before[2]
     until(lambda: served.live.plans > plans and planned_for(served).target == served.page.wishes.target)
@@ -201,17 +202,52 @@ def test_a_slider_changes_the_weight_of_its_cost_and_the_plan(seen: Page, served
     until(lambda: served.page.wishes.terms["effort"] == before)
 
 
+def beside(seen: Page, label: str) -> Locator:
+    """What takes input beside a label."""
+    return seen.locator("div", has=seen.get_by_text(label, exact=True)).last.locator("xpath=..").locator("input")
+
+
 def enter(seen: Page, label: str, value: str) -> None:
     """Type a number beside a slider."""
-    number = seen.locator("div", has=seen.get_by_text(label, exact=True)).last.locator("xpath=..").locator("input").last
+    number = beside(seen, label).last
     number.fill(value)
     number.press("Enter")
 
 
+@pytest.mark.parametrize(("wish", "arrow"), [("spot", (0.28, 0.0, 0.0)), ("roll", (0.2, 0.0, 0.35))])
+def test_the_ball_is_dragged_to_where_it_lies_and_by_how_it_rolls(
+    wish: str, arrow: tuple[float, ...], seen: Page, served: Served
+) -> None:
+    handles = served.page._handles
+    assert handles is not None
+    if served.page.mode != "planned":
+        seen.get_by_text("Reset", exact=True).click()
+        until(lambda: served.page.mode == "planned")
+    time.sleep(2.0)
+    before = getattr(served.page.wishes, wish)
+    drag(seen, placed(seen, served, np.add(handles.resting, arrow)), right=20)
+    until(lambda: getattr(served.page.wishes, wish) != before)
+    until(lambda: getattr(planned_for(served), wish) == getattr(served.page.wishes, wish))
+
+
+def test_a_plan_may_take_as_long_as_the_budget_says(seen: Page, served: Served) -> None:
+    seen.get_by_role("tab", name="Kick").click()
+    for seconds in (0.5, 0.0):
+        enter(seen, "Budget [s]", f"{seconds:g}")
+        until(lambda: planned_for(served).budget == seconds, 120.0)  # noqa: B023
+
+
 @pytest.mark.parametrize(
-    ("label", "field", "value"), [("Preset", "preset", "other"), ("Model", "dynamics", "larp")], ids=["preset", "model"]
+    ("label", "field", "value"),
+    [
+        ("Preset", "preset", "other"),
+        ("Model", "dynamics", "larp"),
+        ("Its weights", "weights", "any human"),
+        ("Reference", "reference", "another"),
+    ],
+    ids=["preset", "model", "weights", "reference"],
 )
-def test_the_next_plan_is_by_the_preset_and_the_model_that_are_chosen(
+def test_the_next_plan_is_by_what_is_chosen_from_a_list(
     label: str, field: str, value: str, seen: Page, served: Served
 ) -> None:
     seen.get_by_role("tab", name="Kick").click()
@@ -223,7 +259,7 @@ def test_the_next_plan_is_by_the_preset_and_the_model_that_are_chosen(
 
 def choose(seen: Page, label: str, value: str) -> None:
     """Choose from a list."""
-    seen.locator("div", has=seen.get_by_text(label, exact=True)).last.locator("xpath=..").locator("input").first.click()
+    beside(seen, label).first.click()
     seen.get_by_role("option", name=value, exact=True).click()
 
 
@@ -261,26 +297,76 @@ def test_a_kick_is_kept_opened_again_and_shown_beside_another(played: Page, serv
     until(lambda: served.page._beside is None)
 
 
-def test_a_push_moves_the_body_that_it_is_for(seen: Page, served: Served) -> None:
+def test_the_clock_is_set_and_goes_at_the_speed_that_is_set(played: Page, served: Served) -> None:
+    panel = served.page.panel
+    panel.playing = False
+    enter(played, "Time [s]", "0.5")
+    until(lambda: panel.time == 0.5)
+    enter(played, "Speed", "0.25")
+    until(lambda: served.page.speed == 0.25)
+    enter(played, "Speed", "2")
+    until(lambda: served.page.speed == 2.0)
+    panel.playing = True
+
+
+@pytest.mark.parametrize(("key", "name", "row"), [("b", "the ball", -1), ("h", "the human", 0)])
+@pytest.mark.parametrize("by", ["key", "button"])
+def test_a_push_moves_the_body_that_it_is_for(
+    by: str, key: str, name: str, row: int, seen: Page, served: Served
+) -> None:
+    seen.get_by_role("tab", name="Kick").click()
+    button = seen.get_by_text(name, exact=True)
+    if not button.is_visible():
+        seen.get_by_text("Push", exact=True).first.click()
+        button.wait_for()
+    enter(seen, "left", "2.5")
+    until(lambda: served.page.push("ball").change[1] == 2.5)
     before = served.live.run
     kick_button(seen).click()
     until(lambda: served.page.mode == "running")
-    seen.keyboard.press("b")
+    seen.keyboard.press(key) if by == "key" else button.click()
     until(lambda: served.live.run is not before)
     assert served.live.run is not None
-    change = np.diff(served.live.run.states[:, -1, 8])  # of the ball's velocity to the left
-    assert change.max() > 0.8, "1 m/s is set"
+    change = np.diff(served.live.run.states[:, row, 8])  # of the velocity to the left
+    assert change.max() > 1.5, "2.5 m/s is set"
 
 
-@pytest.mark.parametrize("kind", ["html", "png"])
-def test_what_is_played_can_be_downloaded(kind: str, played: Page, tmp_path: Path) -> None:
-    button = played.get_by_role("button", name=kind, exact=True)
-    if not button.is_visible():
-        played.get_by_text("View", exact=True).click()
-    with played.expect_download(timeout=60_000) as begun:
+def unfolded(seen: Page, label: str) -> Locator:
+    """What is under "View", which is folded up at first, by its label."""
+    found = seen.get_by_text(label, exact=True)
+    if not found.is_visible():
+        seen.get_by_text("View", exact=True).click()
+        found.wait_for()
+        time.sleep(1.0)  # it unfolds
+    return found
+
+
+@pytest.mark.parametrize("view", [*VIEWS, "follow"])
+def test_each_client_looks_from_where_it_likes(view: str, played: Page, served: Served) -> None:
+    unfolded(played, view).click()
+    until(lambda: [each for each, _ in served.page._views.values()] == [view])
+    ((_, client),) = served.page._server.get_clients().items()
+    stage = served.page._stage
+    assert stage is not None
+    if view in VIEWS:
+        until(lambda: np.allclose(client.camera.position, stage.camera(view, client.camera.aspect).place, atol=0.05))
+
+
+@pytest.mark.parametrize("ghost", ["prediction", "reference", "fan"])
+def test_ghosts_are_seen_only_if_wished_for(ghost: str, played: Page, served: Served) -> None:
+    unfolded(played, f"show {ghost}")
+    for shown in (False, True):
+        beside(played, f"show {ghost}").last.click(force=True)
+        until(lambda: (ghost in served.page.panel.ghosts) == shown)  # noqa: B023
+
+
+@pytest.mark.parametrize(("kind", "begins"), [("html", b"<!do"), ("png", b"\x89PNG"), ("gif", b"GIF8")])
+def test_what_is_played_can_be_downloaded(kind: str, begins: bytes, played: Page, tmp_path: Path) -> None:
+    button = unfolded(played, kind)
+    with played.expect_download(timeout=120_000) as begun:
         button.click()
     begun.value.save_as(tmp_path / "file")
-    assert (tmp_path / "file").read_bytes()[:4] == (b"<!do" if kind == "html" else b"\x89PNG")
+    assert (tmp_path / "file").read_bytes()[:4] == begins
 
 
 def test_a_page_of_elsewhere_cannot_connect(browser: Browser, served: Served, tmp_path: Path) -> None:

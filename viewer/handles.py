@@ -13,6 +13,8 @@ from viewer.wishes import Offer
 
 SIZE = 0.45  # m, of a handle's arrows
 LEAD = 0.3  # s: an arrow ends where the ball would be so much later
+# The handle of how the ball rolls floats so far above where the arrow ends [m], out of the way of the spot's.
+ABOVE = np.array([0.0, 0.0, 0.35])
 ROLLING, FAINT = (204, 121, 167), (140, 190, 170)
 
 
@@ -74,7 +76,7 @@ class Handles:
         with self._server.atomic():
             self._target.position = np.array(self.target)
             self._spot.position = resting
-            self._roll.position = resting + LEAD * np.array((*self.roll, 0.0))
+            self._roll.position = resting + LEAD * np.array((*self.roll, 0.0)) + ABOVE
         self._arrow()
 
     def _arrow(self) -> None:
