@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from larp_model.bodies import human_and_ball
 from larp_model.state import ORIENTATION, POSITION, VELOCITY
 from viewer import LivePage, Recording, check_film, kick_picture, nearest_approach, write_film, write_html
+from viewer.app import Moment, News
 from viewer.camera import Camera
 from viewer.film import frames
 from viewer.panel import Panel
@@ -156,6 +157,24 @@ def test_page_follows_and_plays(page: LivePage, recording: Recording, capsys: py
     page.close()
     assert not page._thread.is_alive()
     assert capsys.readouterr().out == ""
+
+
+@given(st.integers(1, 6), st.integers(1, 8))
+def test_states_that_come_in_bursts_are_drawn_in_order_and_never_far_behind(burst: int, pictures: int) -> None:
+    states = np.zeros((10 * burst, len(SCENE.links), 13))
+    states[:, :, 0] = np.arange(len(states))[:, None]
+    news, came = News(states[0], 0.0), 0
+    for _ in range(10):
+        for _ in range(burst):
+            news.waiting.append(Moment(states[came], came * SCENE.dt, None, None))
+            came += 1
+        for _ in range(pictures):
+            waited = len(news.waiting)
+            news.fresh = False
+            news.go_on()
+            assert news.fresh == (waited > 0) and len(news.waiting) < max(waited, 1)
+        assert len(news.waiting) <= max(burst, 5 * burst // pictures)
+    np.testing.assert_array_equal(np.array(news.path)[:, 0, 0], np.arange(came - len(news.waiting)))
 
 
 def test_update_needs_a_scene(page: LivePage, recording: Recording) -> None:

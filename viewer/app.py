@@ -1,7 +1,7 @@
 """The page on which a kick is planned and watched, live while it runs and again afterwards.
 
 Planning, execution and drawing are apart: whoever plans says what is new and goes on; a thread of the page draws the
-latest of it, 30 times a second at most; what clients send is checked and kept until it is asked for.
+latest of it, 25 times a second at most; what clients send is checked and kept until it is asked for.
 """
 
 from __future__ import annotations
@@ -9,11 +9,12 @@ from __future__ import annotations
 import queue
 import threading
 import time as clock
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import viser
@@ -29,9 +30,11 @@ from viewer.server import address_of, close_server, open_server
 from viewer.stage import LEGEND, Stage, whole
 from viewer.wishes import Offer, Push, Wishes
 
-FRAME = 1.0 / 30.0  # s
+FRAME = 1.0 / 25.0  # s
+# Pictures by which drawing may be behind what happens, where that comes in bursts.
+BEHIND = 5
 # So many clients are drawn for at that pace; more share what time there is, for each takes the planner some.
-AT_FULL_PACE = 3
+AT_FULL_PACE = 5
 FOLLOWED = (-2.2, -3.2, 1.4)  # m, from the ball to a camera that follows it
 
 Mode = Literal["waiting", "planned", "running", "replay"]
@@ -41,27 +44,46 @@ class Stopped(Exception):
     """The page was closed, or asked to stop what runs."""
 
 
+class Moment(NamedTuple):
+    """A state (L, 13) of the truth at a time [s], what was just predicted from there on, and the reference's state."""
+
+    state: np.ndarray
+    time: float
+    predicted: np.ndarray | None
+    reference: np.ndarray | None
+
+
 @dataclass
 class News:
     """What is to be drawn next; None: as it is."""
 
     state: np.ndarray
     time: float
-    path: list[np.ndarray] = field(default_factory=list)
+    path: list[np.ndarray] = field(default_factory=list)  # states (L, 13) so far
     plan: np.ndarray | None = None
     plan_time: float = 0.0
     fan: tuple[np.ndarray, np.ndarray] | None = None
     reference: np.ndarray | None = None
     fresh: bool = True  # all of it, the plan and its fan
     planned: bool = True
+    waiting: deque[Moment] = field(default_factory=deque)
+
+    def go_on(self) -> None:
+        """To the next of the moments that wait, or over some where many do: they come in bursts, between plans."""
+        for _ in range(-(-len(self.waiting) // BEHIND)):
+            moment = self.waiting.popleft()
+            if moment.predicted is not None:
+                self.plan, self.plan_time, self.planned = known(moment.predicted), moment.time, True
+            self.path.append(moment.state)
+            self.state, self.time, self.reference, self.fresh = moment.state, moment.time, moment.reference, True
 
 
 class LivePage:
     """A page that follows a kick while it runs, and plays its recording once it is over.
 
-    `begin`, `planned`, `update` and `finish` return at once; a thread draws. Where states come faster than they can be
-    drawn, the latest wins. With an offer, people set there what they wish: see `wishes` and `asked`. Leaving the `with`
-    block closes the page.
+    `begin`, `planned`, `update` and `finish` return at once; a thread draws, one state after the other, and leaves some
+    out where they come faster than they can be drawn. With an offer, people set there what they wish: see `wishes` and
+    `asked`. Leaving the `with` block closes the page.
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = 8080, offer: Offer | None = None) -> None:
@@ -265,12 +287,8 @@ class LivePage:
                     self._stage.lane.aim(np.array(self._handles.target))
                     self._handles.shown(False)
                 self._panel.watch()
-            news = self._news
-            assert news is not None
-            if predicted is not None:
-                news.plan, news.plan_time, news.planned = known(predicted), time, True
-            news.path.append(self._stage.lane.position(state).copy())
-            news.state, news.time, news.reference, news.fresh = np.array(state), time, reference, True
+            assert self._news is not None
+            self._news.waiting.append(Moment(np.array(state), time, predicted, reference))
 
     def finish(self, recording: Recording, beside: Recording | None = None) -> None:
         """Offer a recording for play, and another beside it."""
@@ -362,6 +380,7 @@ class LivePage:
 
     def _draw_news(self, stage: Stage, news: News) -> None:
         """What has changed since it was last drawn; of a plan that waits, the ghost goes on moving."""
+        news.go_on()
         lane, plan, waits = stage.lane, news.plan, self._mode == "planned"
         if not news.fresh and not (waits and self._panel.playing):
             return
@@ -375,7 +394,7 @@ class LivePage:
         lane.show(news.state, prediction=expected, reference=news.reference)
         self._frames += 1
         if news.fresh:
-            path = np.array(news.path) if news.path else None
+            path = lane.position(np.array(news.path)) if news.path else None
             miss = lane.trace(path, None if plan is None else lane.position(plan), news.planned)
             if news.planned:
                 lane.fan(*(news.fan or (None, None)) if "fan" in lane.shown else (None, None))

@@ -24,6 +24,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
+from mpc.loop import Execution
 from tasks.benchmarks import report
 from tasks.command import remember_compilations, run
 from tasks.data import random_task
@@ -189,9 +190,16 @@ def main(
 
 
 def headless(live: Live, kick: Kick, target: np.ndarray, preset: PresetName, seed: int) -> report.Row:
-    """The same kick while nothing is drawn."""
+    """The same kick at the same pace, that of time, while nothing is drawn: planning after a rest is slower anyway."""
+    begun = time.monotonic()
+
+    def observe(execution: Execution) -> None:
+        nonlocal begun
+        begun = max(begun + kick.scene.dt, time.monotonic() - kick.scene.dt)
+        time.sleep(max(0.0, begun - time.monotonic()))
+
     live.page.panel.playing = False
-    found = kick.to(target, preset, seed=seed).summary
+    found = kick.to(target, preset, seed=seed, observe=observe).summary
     live.page.panel.playing = True
     return {"plan_seconds": found["plan_seconds"], "replan_ms": found["replan_ms"]["p50"]}
 
