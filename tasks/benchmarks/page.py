@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
+from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +41,8 @@ STAYS = 3.0
 WARM_UP = 3
 
 
-def watch(address: str, clients: int) -> None:
-    """Be so many clients until ended; one more comes, stays a while and leaves, on and on."""
+def watch(address: str, clients: int, visits: Synchronized[int]) -> None:
+    """Be so many clients until ended; one more comes, stays a while and leaves, on and on: these visits are counted."""
 
     def one(number: int, seconds: float) -> None:
         end = time.monotonic() + seconds
@@ -62,6 +63,8 @@ def watch(address: str, clients: int) -> None:
         thread.start()
     while True:
         one(0, STAYS)
+        with visits:
+            visits.value += 1
 
 
 def until(what: Callable[[], object], seconds: float = 120.0) -> float:
@@ -111,6 +114,7 @@ def of_drag(live: Live, target: np.ndarray) -> report.Row:
 
 def main(
     kicks: int = 20,
+    alone: int = 20,
     clients: int = 10,
     preset: PresetName = "fast",
     seed: int = 7,
@@ -120,22 +124,24 @@ def main(
     """Measure what a page costs whoever plans, and whether it leaves anything behind.
 
     Args:
-        kicks: with the page, and as many without.
+        kicks: with the page.
+        alone: so many of them without it too.
         clients: that watch, a fifth of them slow; one more comes and goes.
         preset: of the plans.
         seed: of the targets.
         json: where the figures go.
         publish: update RESULTS.md.
     """
-    if kicks < 1 or clients < 1:
-        raise ValueError(f"kicks and clients are {kicks} and {clients}, but must be at least 1")
+    if min(kicks, alone, clients) < 1:
+        raise ValueError(f"kicks, alone and clients are {kicks}, {alone} and {clients}, but must be at least 1")
     report.ready(json, publish)
     remember_compilations()
     random = np.random.default_rng(seed)
     targets = [random_task(random)[0] for _ in range(kicks)]
     kick = Kick.standard()
     choices = Choices({"embedded": lambda: kick}, {preset: PRESETS[preset]}, ("larp",), weights_for(kick, None))
-    process = psutil.Process()
+    process, begun = psutil.Process(), time.monotonic()
+    kick.to(USUAL, preset)  # what plans and steps keeps its threads
     before = process.num_threads()
     with tempfile.TemporaryDirectory() as folder, LivePage(port=0, offer=choices.offer(kick)) as page:
         live = Live(page, choices, USUAL, Path(folder), seed, wished)
@@ -144,7 +150,8 @@ def main(
         until(lambda: page.mode == "planned", 300.0)
         address = page.address.replace("http", "ws")
         spawn = multiprocessing.get_context("spawn")
-        watching = spawn.Process(target=watch, args=(address, clients), daemon=True)
+        visits = spawn.Value("i", 0)
+        watching = spawn.Process(target=watch, args=(address, clients, visits), daemon=True)
         watching.start()
         until(lambda: len(process.net_connections("tcp")) > clients, 60.0)
         for _ in range(WARM_UP):
@@ -155,7 +162,8 @@ def main(
         for index, target in enumerate(targets):
             jobs[f"drag {index}"] = partial(of_drag, live, target)
             jobs[f"watched {index}"] = partial(of_kick, live, partial(page.ask, "kick"))
-            jobs[f"alone {index}"] = partial(headless, live, kick, target, preset, seed)
+            if index < alone:
+                jobs[f"alone {index}"] = partial(headless, live, kick, target, preset, seed)
         command = f"python -m tasks.benchmarks.page --kicks {kicks} --clients {clients} --preset {preset} --seed {seed}"
         rows = dict(zip(jobs, report.collect(json, command, jobs), strict=True))
         grown = process.memory_info().rss / memory - 1.0
@@ -165,6 +173,8 @@ def main(
     figures = summary(rows) | {
         "memory_growth": grown,
         "sockets_left": len(process.net_connections("tcp")),
+        "minutes": (time.monotonic() - begun) / 60.0,
+        "visits": visits.value,
         "threads_before": before,
         "threads_after": process.num_threads(),
     }
@@ -182,6 +192,8 @@ def main(
         ("memory grew by", f"{100 * grown:.1f} %"),
         ("sockets left", str(figures["sockets_left"])),
         ("threads before and after", f"{before} and {figures['threads_after']}"),
+        ("clients that came and left", str(figures["visits"])),
+        ("it took", f"{figures['minutes']:.0f} min"),
     ):
         table.add_row(name, value)
     report.show(table)
@@ -211,11 +223,12 @@ def summary(rows: dict[str, report.Row]) -> dict[str, Any]:
         return np.array([row[name] for key, row in rows.items() if key.startswith(kind)])
 
     watched, alone = values("watched", "replan_ms"), values("alone", "replan_ms")
+    paired = watched[: len(alone)]
     drags = values("drag", "drag_seconds")
     return {
-        "watched_ms": float(np.median(watched)),
+        "watched_ms": float(np.median(paired)),
         "alone_ms": float(np.median(alone)),
-        "slower": float(np.median(watched / alone) - 1.0),
+        "slower": float(np.median(paired / alone) - 1.0),
         "drag_s": float(np.median(drags)),
         "drag_worst_s": float(drags.max()),
         "frames_per_second": float(np.median(values("watched", "frames_per_second"))),
