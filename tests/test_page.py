@@ -230,13 +230,6 @@ def test_the_ball_is_dragged_to_where_it_lies_and_by_how_it_rolls(
     until(lambda: getattr(planned_for(served), wish) == getattr(served.page.wishes, wish))
 
 
-def test_a_plan_may_take_as_long_as_the_budget_says(seen: Page, served: Served) -> None:
-    seen.get_by_role("tab", name="Kick").click()
-    for seconds in (0.5, 0.0):
-        enter(seen, "Budget [s]", f"{seconds:g}")
-        until(lambda: planned_for(served).budget == seconds, 120.0)  # noqa: B023
-
-
 @pytest.mark.parametrize(
     ("label", "field", "value"),
     [
