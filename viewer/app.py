@@ -394,7 +394,7 @@ class LivePage:
         lane.show(news.state, prediction=expected, reference=news.reference)
         self._frames += 1
         if news.fresh:
-            path = lane.position(np.array(news.path)) if news.path else None
+            path = np.array([lane.position(state) for state in news.path]) if news.path else None
             miss = lane.trace(path, None if plan is None else lane.position(plan), news.planned)
             if news.planned:
                 lane.fan(*(news.fan or (None, None)) if "fan" in lane.shown else (None, None))

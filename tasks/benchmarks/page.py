@@ -164,7 +164,8 @@ def main(
             jobs[f"watched {index}"] = partial(of_kick, live, partial(page.ask, "kick"))
             if index < alone:
                 jobs[f"alone {index}"] = partial(headless, live, kick, target, preset, seed)
-        command = f"python -m tasks.benchmarks.page --kicks {kicks} --clients {clients} --preset {preset} --seed {seed}"
+        counted = f"--kicks {kicks} --alone {alone} --clients {clients}"
+        command = f"python -m tasks.benchmarks.page {counted} --preset {preset} --seed {seed}"
         rows = dict(zip(jobs, report.collect(json, command, jobs), strict=True))
         grown = process.memory_info().rss / memory - 1.0
         watching.kill()
