@@ -25,6 +25,11 @@ def adapt() -> None:
     _start("tasks.adapt")
 
 
+def pose() -> None:
+    """`larp-pose`: motion from keypoints."""
+    _start("tasks.pose")
+
+
 def bench() -> None:
     """`larp-bench`: the benchmarks."""
     _start("tasks.benchmarks.__main__")

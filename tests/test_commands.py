@@ -19,7 +19,7 @@ from tasks.scenarios import scenario
 def test_every_installed_command_exists_and_the_version_is_the_packages() -> None:
     found = {each.name: each.load() for each in entry_points(group="console_scripts") if each.name.startswith("larp-")}
     assert {name: each.__module__ for name, each in found.items()} == dict.fromkeys(
-        ("larp-kick", "larp-train", "larp-adapt", "larp-bench"), "larp_model.commands"
+        ("larp-kick", "larp-train", "larp-adapt", "larp-pose", "larp-bench"), "larp_model.commands"
     )
     assert version("larp-mpc") == larp_model.__version__
 

@@ -1,0 +1,110 @@
+"""The figure that is laid over an image: our human's joints in a pose, its size and proportions free."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from larp_model.bodies import human, segment_of
+from larp_model.rotation import from_rotation_vector, matrix
+from larp_model.scene import Body, Vector
+from tasks.keypoints.points import POINTS, SIDES
+
+# What of a body may differ from the usual: a link's length, or the radius by which the shoulders are apart.
+PROPORTIONS = (
+    ("pelvis", 0), ("torso", 0), ("torso", 1), ("head", 0),
+    ("upper_arm", 0), ("lower_arm", 0), ("thigh", 0), ("shin", 0), ("foot", 0),
+)  # fmt: skip
+# Where each point is on its link, as a joint's anchor: along its axis in half-lengths, across it in radii. Shoulders,
+# elbows, hips, knees and ankles are joints; a wrist is where forearms end (0.146 of a height, D. Winter).
+ON_LIMBS: dict[str, tuple[str, Vector]] = {
+    "shoulder": ("upper_arm", (0.0, 0.0, 1.1)),
+    "elbow": ("lower_arm", (0.0, 0.0, 1.0)),
+    "wrist": ("lower_arm", (0.0, 0.0, -0.7)),
+    "hip": ("thigh", (0.0, 0.0, 1.35)),
+    "knee": ("shin", (0.0, 0.0, 1.35)),
+    "ankle": ("foot", (-0.7, 0.0, 0.6)),
+    "heel": ("foot", (-1.3, 0.0, -0.6)),
+    "toe": ("foot", (1.35, 0.0, -0.6)),
+}
+ON_HEAD: dict[str, Vector] = {"nose": (1.0, 0.0, 0.0), "left_ear": (0.0, 0.8, 0.2), "right_ear": (0.0, -0.8, 0.2)}
+SHARED = 1 + len(PROPORTIONS) + 1
+# How high heel and toe are where the foot stands [m].
+SOLE = 0.017
+
+
+class Pose(NamedTuple):
+    """Of the figure in T frames: pelvis (T, 3) [m], its turn (T, 3, 3), joint angles (T, J, 3) [rad]."""
+
+    place: np.ndarray
+    turn: np.ndarray
+    angles: np.ndarray
+
+
+class Figure:
+    """A human whose points follow from its pose and proportions.
+
+    Proportions (11,) are logarithms: of the whole, as a share of a human of 1.75 m, and of each of `PROPORTIONS` beside
+    that. The last is by how much the shoulders are seen ahead of the trunk, in lengths of the torso.
+    """
+
+    def __init__(self) -> None:
+        self.body = human()
+        self.sizes = self.body.sizes
+        names = [link.name for link in self.body.links]
+        self.anchors = {name: (names.index("head"), at) for name, at in ON_HEAD.items()} | {
+            f"{side}_{limb}": (names.index(f"{side}_{link}"), at)
+            for limb, (link, at) in ON_LIMBS.items()
+            for side in SIDES
+        }
+        self.joints, self.torso = len(self.body.joints), names.index("torso")
+        motors = [motor for _, _, motor in self.body.motors]
+        self.lower = np.array([motor.lower for motor in motors])
+        self.upper = np.array([motor.upper for motor in motors])
+        share = np.zeros((len(PROPORTIONS), len(names), 2))
+        for row, (segment, what) in enumerate(PROPORTIONS):
+            share[row, [segment_of(name) == segment for name in names], what] = 1.0
+        self._share = share
+
+    def scaled(self, proportions: Array) -> Array:
+        """Lengths and radii (n, 2) [m] of the links."""
+        grown = proportions[0] + jnp.einsum("p,pnk->nk", proportions[1:-1], jnp.asarray(self._share))
+        return jnp.asarray(self.sizes[:, :2]) * jnp.exp(grown)
+
+    def of(self, proportions: np.ndarray) -> Body:
+        """The human of these proportions, as heavy as its volume says."""
+        sizes = np.array(self.sizes)
+        sizes[:, :2] = np.asarray(self.scaled(jnp.asarray(proportions)), float)
+        sizes[:, 2] *= np.exp(3.0 * float(proportions[0]))
+        return self.body.sized(sizes)
+
+    def points(self, place: Array, turn: Array, angles: Array, proportions: Array) -> Array:
+        """Points (P, 3) [m] of one pose: pelvis (3,) [m], its turn (3, 3), joint angles (J, 3) [rad]."""
+        sizes = self.scaled(proportions)
+        turned = matrix(from_rotation_vector(angles))
+        places, turns = [place], [turn]
+
+        def reach(link: int, at: Vector) -> Array:
+            axis = np.asarray(self.body.links[link].axis)
+            along = np.asarray(at) @ axis * axis
+            return turns[link] @ (0.5 * sizes[link, 0] * along + sizes[link, 1] * (np.asarray(at) - along))
+
+        for child, joint in enumerate(self.body.joints, start=1):
+            turns.append(turns[joint.parent] @ turned[child - 1])
+            tied = places[joint.parent] + reach(joint.parent, joint.parent_anchor)
+            places.append(tied - reach(child, joint.child_anchor))
+        found = {name: places[link] + reach(link, at) for name, (link, at) in self.anchors.items()}
+        ahead = proportions[-1] * sizes[self.torso, 0] * turns[self.torso][:, 0]
+        return jnp.stack([found[name] + ahead if "shoulder" in name else found[name] for name in POINTS])
+
+    def all_points(self, pose: Pose, proportions: np.ndarray) -> np.ndarray:
+        """Points (T, P, 3) [m] of all frames."""
+        given = (jnp.asarray(each, jnp.float32) for each in (*pose, proportions))
+        return np.asarray(_all_points(self, *given), float)
+
+
+_all_points = jax.jit(lambda figure, *given: jax.vmap(figure.points, (0, 0, 0, None))(*given), static_argnums=0)

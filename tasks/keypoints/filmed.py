@@ -1,0 +1,104 @@
+"""Motions as a detector would see them: a camera, noise, points that are missed or taken for the other side's."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from tasks.keypoints.camera import Camera, focal_length, looking
+from tasks.keypoints.points import POINTS, SIDES, Keypoints
+from tasks.motions.skeleton import Motion
+
+# What a skeleton calls the joints at which our points are.
+JOINTS = {
+    "shoulder": "Arm", "elbow": "ForeArm", "wrist": "Hand", "hip": "UpLeg", "knee": "Leg", "ankle": "Foot",
+}  # fmt: skip
+# Points that skeletons lack, in the rest pose ahead, aside and above a joint, in shares of the hips' height.
+BESIDE = {
+    "nose": ("Head", (0.105, 0.0, 0.07)),
+    "left_ear": ("Head", (0.02, 0.08, 0.08)),
+    "right_ear": ("Head", (0.02, -0.08, 0.08)),
+    "heel": ("Foot", (-0.045, 0.0, -0.07)),
+    "toe": ("ToeBase", (0.06, 0.0, 0.0)),
+}
+SIZE = (1000.0, 1000.0)
+
+
+class Noise(NamedTuple):
+    """Of a detector: how far its points are off [px], shares that are missed, or taken for the other side's."""
+
+    pixels: float = 4.0
+    missed: float = 0.03
+    swapped: float = 0.01
+
+
+USUAL = Noise()
+
+
+def points_of(motion: Motion) -> np.ndarray:
+    """Where `POINTS` are in a captured motion (T, P, 3) [m]; what its skeleton lacks rides on the nearest joint."""
+    found, hips = [], motion.hip_height
+    for name in POINTS:
+        side, _, limb = name.partition("_")
+        if limb in JOINTS:
+            found.append(motion.path(side.capitalize() + JOINTS[limb]))
+            continue
+        joint, offset = BESIDE[limb if side in SIDES and limb in BESIDE else name]
+        joint = joint if joint == "Head" else side.capitalize() + joint
+        found.append(motion.path(joint) + motion.rotation(joint).apply(hips * np.array(offset)))
+    return np.stack(found, axis=1)
+
+
+def camera_around(random: np.random.Generator, points: np.ndarray) -> Camera:
+    """A camera somewhere around points (T, P, 3) [m], from the knees' to above head height, which sees all of them."""
+    middle = 0.5 * (points.min(axis=(0, 1)) + points.max(axis=(0, 1)))
+    angle, field_of_view = random.uniform(-np.pi, np.pi), random.uniform(40.0, 75.0)
+    height, focal = random.uniform(0.6, 2.2), focal_length(field_of_view, SIZE[0])
+    aside = np.array([np.cos(angle), np.sin(angle), 0.0])
+    for distance in np.arange(2.5, 30.0, 0.25):
+        position = np.array([*(middle + distance * aside)[:2], height])
+        camera = looking(position, middle, focal, SIZE)
+        ahead = (points - position) @ camera.turn[2]
+        if ahead.min() > 1.0 and abs(camera.project(points) - camera.centre).max() < 0.46 * min(SIZE):
+            break
+    return camera
+
+
+def seen(
+    random: np.random.Generator, camera: Camera, points: np.ndarray, rate: float, noise: Noise = USUAL
+) -> Keypoints:
+    """The keypoints that a detector would give of points (T, P, 3) [m] in a film of so many frames a second.
+
+    Errors are those of single frames in part, in part they last for some. Confidence falls with the error.
+    """
+    frames, count = points.shape[:2]
+    slow = np.array(
+        [np.convolve(each, np.ones(5) / np.sqrt(5.0), "same") for each in _normal(random, 2 * count, frames)]
+    )
+    error = 0.8 * random.standard_normal((frames, count, 2)) + 0.6 * slow.T.reshape(frames, count, 2)
+    places = camera.project(points) + noise.pixels * error
+    confidence = np.clip(0.95 - 0.12 * np.linalg.norm(error, axis=-1) + 0.05 * _normal(random, frames, count), 0.1, 1.0)
+    for limbs in (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle", "heel", "toe")):
+        left, right = ([POINTS.index(f"{side}_{limb}") for limb in limbs] for side in SIDES)
+        for frame in np.flatnonzero(random.random(frames) < noise.swapped):
+            places[frame, left + right] = places[frame, right + left]
+    missed = random.random((frames, count)) < noise.missed
+    for point in range(count):  # some are hidden for a while
+        if random.random() < 10.0 * noise.missed:
+            begin = random.integers(frames)
+            missed[begin : begin + round(0.3 * rate), point] = True
+    places[missed], confidence[missed] = np.nan, 0.0
+    return Keypoints(places, confidence, rate, SIZE)
+
+
+def _normal(random: np.random.Generator, *shape: int) -> np.ndarray:
+    return random.standard_normal(shape)
+
+
+def resampled(points: np.ndarray, rate: float, wanted: float) -> np.ndarray:
+    """Points (T, P, 3) at another number of frames a second, in between linearly."""
+    times = np.arange(int((len(points) - 1) * wanted / rate) + 1) * rate / wanted
+    before = np.minimum(times.astype(int), len(points) - 2)
+    share = (times - before)[:, None, None]
+    return (1.0 - share) * points[before] + share * points[before + 1]

@@ -1,0 +1,413 @@
+"""Files in which detectors of people leave what they found in the images of a film, read strictly.
+
+OpenPose writes a folder with one JSON file a frame, AlphaPose one list in the form of COCO's results, MMPose one list
+of frames for a film and one file for each of several images; MediaPipe's landmarks come as a list of frames; our own
+form is an npz file. What a file is shows in its content, not in its name.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from textwrap import shorten
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from larp_model.names import require_file, require_known
+from tasks.keypoints.points import POINTS, RATES, SIDES, Keypoints
+
+
+def _pairs(*parts: str) -> tuple[str, ...]:
+    return tuple(f"{side}_{part}" for part in parts for side in SIDES)
+
+
+def _sides(first: str, second: str, *parts: str) -> tuple[str, ...]:
+    return tuple(f"{side}_{part}" for side in (first, second) for part in parts)
+
+
+_ARM, _LEG, _FOOT = ("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"), ("toe", "small_toe", "heel")
+_ARMS, _LEGS = _sides("right", "left", *_ARM), _sides("right", "left", *_LEG)
+_HEAD = ("right_eye", "left_eye", "right_ear", "left_ear")
+_COCO = ("nose", *_pairs("eye", "ear", *_ARM, *_LEG))
+_HALPE = (*_COCO, "head", "neck", "pelvis", *_pairs(*_FOOT))
+# What the points of a person are, by their number. Those of whole bodies, 133 and 136, go on with faces and hands.
+ORDERS = {
+    17: _COCO,
+    18: ("nose", "neck", *_ARMS, *_LEGS, *_HEAD),  # OpenPose's COCO
+    25: ("nose", "neck", *_ARMS, "pelvis", *_LEGS, *_HEAD, *_sides("left", "right", *_FOOT)),  # OpenPose's BODY_25
+    26: _HALPE,
+    33: (  # MediaPipe
+        "nose",
+        *_sides("left", "right", "inner_eye", "eye", "outer_eye"),
+        *_pairs("ear", "mouth", *_ARM, "little_finger", "index_finger", "thumb", *_LEG, "heel", "toe"),
+    ),
+    133: (*_COCO, *_sides("left", "right", *_FOOT)),
+    136: _HALPE,
+}
+
+_UNDERSTOOD = "understood are OpenPose's folder of JSON files, JSON of AlphaPose, MMPose or MediaPipe, and npz"
+_FEWEST_POINTS = 6
+_MOST_FRAMES = 100_000
+_LARGEST = 1e6
+# A person may be lost for this time [s]. Then the points may be this far from where they were, on average: at once
+# [the person's size], and more with the time [sizes a second].
+_LOST, _LEAP, _PACE = 0.5, 0.25, 3.0
+
+
+class Loaded(NamedTuple):
+    """The points of one person, how many people there are, and the number of frames in which another's box and this
+    one's share more than half of the smaller of them: there the two may have been mixed up.
+    """
+
+    keypoints: Keypoints
+    people: int
+    crossed: int
+
+
+class _Detection(NamedTuple):
+    """A person in a frame: places [px] and confidence of `POINTS` (P, 3), and who it is, where the file says so."""
+
+    points: np.ndarray
+    identity: float | None
+
+
+class _Film(NamedTuple):
+    """What a file holds: people in frames by their numbers; frames a second and size [px] where it knows them."""
+
+    frames: Mapping[int, list[_Detection]]
+    rate: float | None = None
+    size: tuple[float, float] | None = None
+
+
+_Track = dict[int, _Detection]  # one person's, by frame, in the order of the frames
+
+
+def load(
+    path: str | Path, rate: float | None = None, size: tuple[float, float] | None = None, person: int | None = None
+) -> Loaded:
+    """Read one person's points; ValueError, in one line, says what is missing, damaged or not understood.
+
+    path: a file, or a folder with one for each frame. rate: frames a second. size: width and height of the images [px].
+    Only npz files hold these two, and the arguments win. person: which one, from 0 in order of appearance; by default
+    the one who is seen the longest, largest and best. The frame with the lowest number in the file comes first.
+
+    An npz file has names (P,) out of `POINTS`, and places (T, P, 2), NaN where not found, perhaps with confidence
+    (T, P), or points (T, P, 3) that hold both; perhaps also rate and size (2,).
+    """
+    path = Path(path)
+    name = path.absolute().name
+    if not path.is_dir():
+        require_file("path", path)
+    size = None if size is None else _size(size)
+    try:
+        film = _read(path, size)
+        frames = _in_order(film.frames)
+    except ValueError as error:
+        raise ValueError(f"{name} {error}") from None
+    rate = film.rate if rate is None else rate
+    if rate is None:
+        raise ValueError(f"rate is not known, {name} does not hold it: give frames a second")
+    if not RATES[0] <= rate <= RATES[1]:
+        raise ValueError(f"rate is {rate:g}, but must be from {RATES[0]:g} to {RATES[1]:g} frames a second")
+    tracks = _tracks(frames, rate)
+    if person is not None and person not in range(len(tracks)):
+        raise ValueError(f"person is {person}, but must be from 0 to below {len(tracks)}, the people in {name}")
+    track = max(tracks, key=_prominence) if person is None else tracks[person]
+    points = np.full((len(frames), len(POINTS), 3), (np.nan, np.nan, 0.0))
+    points[list(track)] = [one.points for one in track.values()]
+    seen = np.flatnonzero(points[..., 2].any(axis=0))
+    if len(seen) < _FEWEST_POINTS:
+        only = ", ".join(POINTS[point] for point in seen)
+        raise ValueError(f"{name} has only {only} of this person, but needs {_FEWEST_POINTS} points or more")
+    keypoints = Keypoints(points[..., :2], points[..., 2], float(rate), size or film.size)
+    return Loaded(keypoints, len(tracks), sum(_crossed(one, frames[frame]) for frame, one in track.items()))
+
+
+def _read(path: Path, size: tuple[float, float] | None) -> _Film:
+    if path.is_dir():
+        return _Film(_folder(path))
+    with path.open("rb") as file:
+        zipped = file.read(2) == b"PK"
+    return _npz(path) if zipped else _Film(_frames(_parsed(path), size))
+
+
+def _in_order(frames: Mapping[int, list[_Detection]]) -> list[list[_Detection]]:
+    """All frames from the first number to the last, missing ones empty; people of whom nothing was found left out."""
+    if not frames:
+        raise ValueError("has no frames")
+    first, last = min(frames), max(frames)
+    if last - first >= _MOST_FRAMES:
+        raise ValueError(f"has frames from {first} to {last}, but may have {_MOST_FRAMES} at most")
+    numbers = range(first, last + 1)
+    found = [[one for one in frames.get(number, []) if one.points[:, 2].any()] for number in numbers]
+    if not any(found):
+        raise ValueError("has no person in any frame")
+    return found
+
+
+def _folder(path: Path) -> dict[int, list[_Detection]]:
+    frames = {}
+    names = sorted(file.name for file in path.glob("*.json") if not file.name.startswith("."))
+    for number, name in _numbered(names).items():
+        try:
+            match _parsed(path / str(name)):
+                case {"people": people} | [*people]:
+                    frames[number] = _people(people)
+                case _:
+                    raise ValueError("has no list of people")
+        except ValueError as error:
+            raise ValueError(f"has {name}, which {error}") from None
+    return frames
+
+
+def _numbered(labels: Iterable[object]) -> dict[int, object]:
+    """The frames' labels, their images' names or files', by the last number in each, its ending left out."""
+    numbered: dict[int, object] = {}
+    for label in labels:
+        numbers = re.findall(r"\d+", Path(str(label)).stem)
+        if not numbers:
+            raise ValueError(f"has {_short(label)} as a frame, but needs the frame's number in the name")
+        if int(numbers[-1]) in numbered:
+            raise ValueError(f"has two frames with number {int(numbers[-1])}, but needs the frames of one film")
+        numbered[int(numbers[-1])] = label
+    return numbered
+
+
+def _parsed(path: Path) -> object:
+    try:
+        return json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"is not whole as JSON ({error}); {_UNDERSTOOD}") from None
+
+
+def _frames(content: object, size: tuple[float, float] | None) -> dict[int, list[_Detection]]:
+    """The frames of a JSON file that holds all of them."""
+    match content:
+        case {"instance_info": [*entries], **more}:
+            return _of_mmpose(entries, _called(more.get("meta_info")))
+        case [*entries]:
+            match next((entry for entry in entries if entry), []):
+                case {"image_id": _}:
+                    return _of_alphapose(entries)
+                case {"frame_id": _}:
+                    return _of_mmpose(entries)
+                case {"landmarks": _} | [{"x": _}, *_]:
+                    return {number: _of_mediapipe(entry, size) for number, entry in enumerate(entries)}
+                case [] | [{"keypoints": _}, *_]:
+                    return {number: _people(entry) for number, entry in enumerate(entries)}
+    raise ValueError(f"is JSON of another kind; {_UNDERSTOOD}")
+
+
+def _of_alphapose(entries: list) -> dict[int, list[_Detection]]:
+    if not all(isinstance(entry, dict) and "image_id" in entry for entry in entries):
+        raise ValueError("has an entry without image_id")
+    people: dict[object, list] = {}
+    for entry in entries:
+        people.setdefault(str(entry["image_id"]), []).append(entry)
+    return {number: _people(people[image]) for number, image in _numbered(people).items()}
+
+
+def _of_mmpose(entries: list, names: tuple[str, ...] | None = None) -> dict[int, list[_Detection]]:
+    if not all(isinstance(entry, dict) and {"frame_id", "instances"} <= entry.keys() for entry in entries):
+        raise ValueError("has an entry without frame_id and instances")
+    numbers = _numbered(entry["frame_id"] for entry in entries)
+    return {number: _people(entry["instances"], names) for number, entry in zip(numbers, entries, strict=True)}
+
+
+def _called(meta: object) -> tuple[str, ...] | None:
+    """What MMPose itself calls the points, in their order."""
+    match meta:
+        case {"keypoint_id2name": {**table}}:
+            order = [str(number) for number in range(len(table))]
+            if set(order) != set(table):
+                raise ValueError("has keypoint_id2name, but needs a name there for each number from 0")
+            return tuple(str(table[number]).replace("_big_toe", "_toe") for number in order)
+    return None
+
+
+def _people(entries: object, names: tuple[str, ...] | None = None) -> list[_Detection]:
+    """The people of a frame of OpenPose, AlphaPose or MMPose."""
+    found = []
+    for entry in _list(entries):
+        match entry:
+            case {"keypoints": places, "keypoint_scores": scores}:
+                places, scores = _numbers("keypoints", places), _numbers("keypoint_scores", scores)
+                if scores.ndim != 1 or places.shape != (len(scores), 2):
+                    raise ValueError(f"has keypoints {places.shape}, but needs (P, 2), and keypoint_scores (P,)")
+                rows = np.column_stack([places, scores])
+            case {"pose_keypoints_2d": numbers} | {"keypoints": numbers}:
+                rows = _numbers("keypoints", numbers)
+                if rows.size % 3:
+                    raise ValueError(f"has keypoints of {rows.size} numbers, but needs x, y and confidence of each")
+                rows = rows.reshape(-1, 3)
+            case _:
+                raise ValueError("has a person without keypoints")
+        rows[(rows[:, :2] == 0.0).all(axis=1)] = 0.0
+        identity = next((entry[key] for key in ("person_id", "idx", "track_id") if key in entry), None)
+        found.append(_Detection(_ours(rows, names), _identity(identity)))
+    return found
+
+
+def _of_mediapipe(frame: object, size: tuple[float, float] | None) -> list[_Detection]:
+    landmarks = _list(frame.get("landmarks", frame) if isinstance(frame, dict) else frame)
+    if size is None:
+        raise ValueError("has places as parts of the image: give size, its width and height in pixels")
+    try:
+        rows = [[landmark[key] for key in ("x", "y", "visibility")] for landmark in landmarks]
+    except (KeyError, TypeError):
+        raise ValueError("has a landmark without x, y and visibility") from None
+    # One person, who may be lost for long.
+    return [_Detection(_ours(_numbers("landmarks", rows) * (*size, 1.0)), 0.0)] if rows else []
+
+
+def _npz(path: Path) -> _Film:
+    try:
+        # numpy does not close the file itself if it is damaged.
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            held = dict(arrays)
+    except Exception:  # Each part of an archive is damaged in its own way.
+        raise ValueError("is no whole npz file of numbers and names") from None
+    kind, columns = ("points", 3) if "points" in held else ("places", 2)
+    if not {"names", kind} <= held.keys():
+        raise ValueError("is npz without names, and places or points")
+    names = tuple(str(name) for name in held["names"].ravel())
+    for name in names:
+        require_known("has a name that", name, POINTS)
+    if len(set(names)) < len(names):
+        raise ValueError("has a name twice")
+    rows = _numbers(kind, held[kind])
+    if rows.ndim != 3 or rows.shape[1:] != (len(names), columns):
+        raise ValueError(f"has {kind} {rows.shape}, but needs (T, {len(names)}, {columns})")
+    if kind == "places":
+        confidence = _numbers("confidence", held.get("confidence", np.ones(rows.shape[:2])))
+        if confidence.shape != rows.shape[:2]:
+            raise ValueError(f"has confidence {confidence.shape}, but needs {rows.shape[:2]}")
+        rows = np.dstack([rows, confidence])
+    rows[np.isnan(rows[..., :2]).any(axis=-1)] = 0.0
+    rate = _numbers("rate", held.get("rate", np.nan))
+    if rate.shape:
+        raise ValueError(f"has a rate {rate.shape}, but needs one number")
+    return _Film(
+        {number: [_Detection(_ours(frame, names), 0.0)] for number, frame in enumerate(rows)},
+        float(rate) if "rate" in held else None,
+        _size(held["size"]) if "size" in held else None,
+    )
+
+
+def _size(value: object) -> tuple[float, float]:
+    numbers = _numbers("size", value)
+    if numbers.shape != (2,) or not ((numbers > 0.0) & (numbers < _LARGEST)).all():
+        raise ValueError(f"size is {_short(value)}, but must be a width and a height above 0, in pixels")
+    return float(numbers[0]), float(numbers[1])
+
+
+def _short(value: object) -> str:
+    return shorten(str(value), 60, placeholder=" ...") or "nothing"
+
+
+def _list(value: object) -> list:
+    if not isinstance(value, list | None):
+        raise ValueError(f"has {_short(value)} where it needs a list")
+    return value or []
+
+
+def _numbers(what: str, value: object) -> np.ndarray:
+    try:
+        return np.array(value, float)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"has {what} with something that is not a number") from None
+
+
+def _ours(rows: np.ndarray, names: tuple[str, ...] | None = None) -> np.ndarray:
+    """Places [px] and confidence of `POINTS` (P, 3), NaN and 0 where not found, from a detector's, by its names."""
+    if len(rows) not in (ORDERS if names is None else {len(names)}):
+        known = ", ".join(map(str, ORDERS)) if names is None else f"{len(names)}, as many as it names"
+        raise ValueError(f"has a person of {len(rows)} points, but needs {known}")
+    if not (abs(rows) < _LARGEST).all():
+        raise ValueError(f"has places or confidences that are not finite, or not below {_LARGEST:g}")
+    found = np.zeros((len(POINTS), 3))
+    for row, name in enumerate(ORDERS[len(rows)] if names is None else names):
+        if name in POINTS:
+            found[POINTS.index(name)] = rows[row]
+    found[:, 2] = found[:, 2].clip(0.0, 1.0)
+    found[found[:, 2] == 0.0, :2] = np.nan
+    return found
+
+
+def _identity(value: object) -> float | None:
+    """The number that a tracker gave to a person; AlphaPose lists those of all detections that it merged."""
+    while isinstance(value, list):
+        value = value[0] if value else None
+    return value if isinstance(value, int | float) and value >= 0 else None
+
+
+def _tracks(frames: list[list[_Detection]], rate: float) -> list[_Track]:
+    """The people, in order of appearance: as the file tells them apart, else as they are near from frame to frame."""
+    identities = [[one.identity for one in frame if one.identity is not None] for frame in frames]
+    # Without its tracker, AlphaPose gives everybody the same number.
+    if not any(identities) or any(len(set(each)) < len(each) for each in identities):
+        return _followed(frames, rate)
+    tracks: dict[float, _Track] = {}
+    for number, frame in enumerate(frames):
+        for one in frame:
+            if one.identity is not None:
+                tracks.setdefault(one.identity, {})[number] = one
+    return list(tracks.values())
+
+
+def _followed(frames: list[list[_Detection]], rate: float) -> list[_Track]:
+    tracks: list[_Track] = []
+    sizes: list[float] = []  # of each person, the largest so far [px]
+    for number, frame in enumerate(frames):
+        seen = [float(np.linalg.norm(np.ptp(_box(one.points), axis=0))) for one in frame]
+        ages = [number - next(reversed(track)) for track in tracks]
+        recent = [which for which, age in enumerate(ages) if age - 1 <= _LOST * rate]
+        # As parts of what is possible: who was lost for long must not take the place of one who is still there.
+        costs = np.ones((len(recent), len(frame)))
+        for row, which in enumerate(recent):
+            last, reach = tracks[which][number - ages[which]], _LEAP + _PACE * ages[which] / rate
+            for column, one in enumerate(frame):
+                far = _distance(last.points, one.points) / max(sizes[which], seen[column], 1.0)
+                costs[row, column] = min(far / reach, 1.0)
+        pairs = zip(*linear_sum_assignment(costs), strict=True)
+        followed = {column: recent[row] for row, column in pairs if costs[row, column] < 1.0}
+        for column, one in enumerate(frame):
+            which = followed.get(column, len(tracks))
+            if which == len(tracks):
+                tracks.append({})
+                sizes.append(0.0)
+            tracks[which][number] = one
+            sizes[which] = max(sizes[which], seen[column])
+    return tracks
+
+
+def _distance(points: np.ndarray, others: np.ndarray) -> float:
+    """Mean distance [px], by confidence, of the points that both have; infinite without any."""
+    weights = points[:, 2] * others[:, 2]
+    both = weights > 0.0
+    if not both.any():
+        return np.inf
+    return float(np.average(np.linalg.norm(points[both, :2] - others[both, :2], axis=-1), weights=weights[both]))
+
+
+def _box(points: np.ndarray) -> np.ndarray:
+    """Upper left and lower right corner (2, 2) [px] around the points that were found."""
+    found = points[points[:, 2] > 0.0, :2]
+    return np.array([found.min(axis=0), found.max(axis=0)])
+
+
+def _prominence(track: _Track) -> float:
+    return sum(float(one.points[:, 2].mean() * np.ptp(_box(one.points)[:, 1])) for one in track.values())
+
+
+def _crossed(one: _Detection, frame: list[_Detection]) -> bool:
+    own = _box(one.points)
+    for box in [_box(other.points) for other in frame if other is not one]:
+        shared = (np.minimum(box[1], own[1]) - np.maximum(box[0], own[0])).clip(0.0)
+        if np.prod(shared) > 0.5 * min(np.prod(np.ptp(each, axis=0)) for each in (box, own)):
+            return True
+    return False

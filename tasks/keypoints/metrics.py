@@ -1,0 +1,81 @@
+"""How far a reconstructed motion is from the true one, and how plausible it is: the paper's figures, and ours."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tasks.keypoints.points import POINTS
+
+# Joints that are compared; hips are also what a pose is aligned by.
+JOINTS = [row for row, name in enumerate(POINTS) if name.partition("_")[2] not in ("heel", "toe", "ear")]
+HIPS = [POINTS.index("left_hip"), POINTS.index("right_hip")]
+FEET = {side: [POINTS.index(f"{side}_heel"), POINTS.index(f"{side}_toe")] for side in ("left", "right")}
+# A foot skates where it is in contact in two frames and moves farther in between [m].
+SKATE = 0.02
+# A foot is in contact where neither its heel nor its toe is higher above the ground [m].
+CONTACT = 0.05
+
+
+def pelvis(points: np.ndarray) -> np.ndarray:
+    """The middle between the hips (*, 1, 3) of points (*, P, 3)."""
+    return points[..., HIPS, :].mean(axis=-2, keepdims=True)
+
+
+def position_errors(found: np.ndarray, true: np.ndarray) -> dict[str, float]:
+    """Mean joint errors [mm] of points (T, P, 3) [m]: `mpjpe_g_mm`, `mpjpe_mm` and `mpjpe_pa_mm`.
+
+    Aligned by the pelvis of the first frame, by that of each frame, and by each frame's best turn, shift and scale
+    (Procrustes).
+    """
+
+    def mean(one: np.ndarray, other: np.ndarray) -> float:
+        return 1e3 * float(np.linalg.norm(one[:, JOINTS] - other[:, JOINTS], axis=-1).mean())
+
+    aligned = np.stack([procrustes(each, wanted) for each, wanted in zip(found, true, strict=True)])
+    return {
+        "mpjpe_g_mm": mean(found - pelvis(found[0]), true - pelvis(true[0])),
+        "mpjpe_mm": mean(found - pelvis(found), true - pelvis(true)),
+        "mpjpe_pa_mm": mean(aligned, true),
+    }
+
+
+def procrustes(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Points (P, 3) turned, shifted and scaled so that their joints come as near to the true ones as they can."""
+    own, other = found[JOINTS], true[JOINTS]
+    middle, wanted = own.mean(axis=0), other.mean(axis=0)
+    turn, _ = Rotation.align_vectors(other - wanted, own - middle)
+    turned = turn.apply(own - middle)
+    scale = np.sum(turned * (other - wanted)) / np.sum(turned**2)
+    return scale * turn.apply(found - middle) + wanted
+
+
+def velocity_error(found: np.ndarray, true: np.ndarray, rate: float) -> float:
+    """Mean error [m/s] of the joints' velocities of points (T, P, 3) [m], aligned by the pelvis of each frame.
+
+    The paper gives no unit; DiffPhy's are of metres a frame.
+    """
+    both = ((each - pelvis(each))[:, JOINTS] for each in (found, true))
+    one, other = (rate * np.diff(each, axis=0) for each in both)
+    return float(np.linalg.norm(one - other, axis=-1).mean())
+
+
+def foot_skate(points: np.ndarray, ground: float = 0.0) -> float:
+    """Share of frames [%] in which a foot in contact moves by more than 2 cm to the next; points (T, P, 3) [m]."""
+    skating = np.zeros(len(points) - 1, bool)
+    for rows in FEET.values():
+        low: np.ndarray = np.all(points[:, rows, 2] - ground < CONTACT, axis=1)
+        moved = np.linalg.norm(np.diff(points[:, rows].mean(axis=1), axis=0), axis=-1)
+        skating = np.logical_or(skating, low[:-1] & low[1:] & (moved > SKATE))
+    return 100.0 * float(skating.mean())
+
+
+def pixel_error(places: np.ndarray, true: np.ndarray) -> float:
+    """Mean distance [px] of places (T, P, 2) of joints."""
+    return float(np.linalg.norm(places[:, JOINTS] - true[:, JOINTS], axis=-1).mean())
+
+
+def off_the_ground(points: np.ndarray) -> dict[str, float]:
+    """How deep feet of points (T, P, 3) [m] are in the ground, and the share of frames [%] in which by over 2 cm."""
+    lowest = points[:, [row for rows in FEET.values() for row in rows], 2].min(axis=1)
+    return {"sunk_mm": 1e3 * float(np.maximum(-lowest, 0.0).mean()), "sunk": 100.0 * float((lowest < -0.02).mean())}

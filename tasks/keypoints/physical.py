@@ -1,0 +1,198 @@
+"""The physical fit: a servo-driven human whose image lies on the keypoints, executed in the truth.
+
+    minimise over theta   w_2 sum_i,t c_it |project(p_i(t)) - y_it|^2      points lie where the detector saw them
+                        + w_x sum_i,t |x_i(t) - x_i^start(t)|^2           links stay near the kinematic start
+                        + w_s sum_f,t a_ft |p_f'(t)|^2                    feet that stand stay
+                        + w_e |Q - Q^start|^2                             joint targets stay near the start's
+                        + w_d |Q''|^2                                     and are smooth
+    subject to            S_{t+1} = dynamics(S_t, Q_t),  Q = Q^start + spline(theta)
+
+in windows that overlap, each from the state that the truth has reached, warm-started by the last. The dynamics are LARP
+or MuJoCo; what comes out is what MuJoCo did.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from scipy.spatial.transform import Rotation, Slerp
+
+from larp_model import state as packed
+from larp_model.rotation import matrix
+from larp_model.scene import Body, Scene, anchor
+from larp_model.truth.mujoco import Truth, closed
+from mpc import CostTerm, Dynamics, Optimizer, Planner, quadratic
+from mpc.loop import Execution, Phase, Window, execute
+from tasks.data import stray
+from tasks.keypoints.camera import Camera
+from tasks.keypoints.figure import Figure, Pose
+from tasks.keypoints.lift import FEET, PIXELS, SLOW, Lifted
+from tasks.keypoints.points import POINTS, Keypoints
+from tasks.motions.references import clearance
+from tasks.presets import usable
+
+HORIZON, KNOTS, EVERY = 50, 11, 5
+# Spread of a first plan, as a share of how far the training data strays from its motions.
+SEARCH = 0.5
+# What counts as one unit of each cost: distances from the kinematic start [m], a standing foot's speed [m/s].
+NEAR, PACE, STILL = 0.05, 0.5, 0.3
+
+
+class Wanted(NamedTuple):
+    """What a film asks for at each of N steps.
+
+    states (N, L, 13) and targets (N, J, 3) [rad] of the kinematic start; places (N, P, 2) [px] and weights (N, P) of
+    the keypoints; stands (N, 4), how much heels and toes look as if they stood.
+    """
+
+    states: np.ndarray
+    targets: np.ndarray
+    places: np.ndarray
+    weights: np.ndarray
+    stands: np.ndarray
+
+
+def wanted_of(scene: Scene, figure: Figure, lifted: Lifted, keypoints: Keypoints) -> Wanted:
+    """The kinematic start and the keypoints at every step of the scene's time.
+
+    The joint targets are ahead of the angles by what the servos lag behind: damping / stiffness.
+    """
+    human = scene.bodies[0]
+    begin = np.arange(len(keypoints)) / keypoints.rate
+    times = np.arange(int(begin[-1] / scene.dt + 1e-6) + 1) * scene.dt
+    place = np.stack([np.interp(times, begin, axis) for axis in lifted.pose.place.T], axis=1)
+    root = Slerp(begin, Rotation.from_matrix(lifted.pose.turn))(times)
+    flat = lifted.pose.angles.reshape(len(begin), -1)
+    angles = np.stack([np.interp(times, begin, each) for each in flat.T], axis=1).reshape(len(times), -1, 3)
+    angles = np.clip(angles, figure.lower, figure.upper)
+    states = np.zeros((len(times), len(human.links), packed.SIZE))
+    turns = [root]
+    for child, joint in enumerate(human.joints, start=1):
+        turns.append(turns[joint.parent] * Rotation.from_rotvec(angles[:, child - 1]))
+    for row, turned in enumerate(turns):
+        states[:, row, packed.ORIENTATION] = turned.as_quat(scalar_first=True)
+        spin = (turned[1:] * turned[:-1].inv()).as_rotvec() / scene.dt
+        states[:, row, packed.ANGULAR_VELOCITY] = np.concatenate([spin, spin[-1:]])
+    states[:, 0, packed.POSITION] = place
+    states[:, 0, packed.VELOCITY] = np.gradient(place, scene.dt, axis=0)
+    states = closed(scene, states)
+    lag = np.array([motor.damping / motor.stiffness for motor in scene.motors])[:, None]
+    targets = angles + lag * np.gradient(angles, scene.dt, axis=0)
+
+    seen = np.nan_to_num(keypoints.places)
+    found = lifted.camera.project(figure.all_points(lifted.pose, lifted.proportions))
+    apart = np.linalg.norm(found - seen, axis=-1) / (PIXELS * max(keypoints.size or 2.0 * lifted.camera.centre))
+    trusted = keypoints.confidence / (1.0 + (apart / 6.0) ** 2) ** 2
+    nearest = np.minimum(np.rint(times * keypoints.rate).astype(int), len(keypoints) - 1)
+    both = np.where(keypoints.seen[..., None], seen, found).reshape(len(begin), -1)
+    places = np.stack([np.interp(times, begin, each) for each in both.T], axis=1).reshape(len(times), -1, 2)
+    points = figure.all_points(Pose(place, root.as_matrix(), angles), lifted.proportions)[:, FEET]
+    speed = np.linalg.norm(np.gradient(points, scene.dt, axis=0), axis=-1)
+    stands = np.exp(-((np.maximum(points[..., 2] - 0.03, 0.0) / 0.05) ** 2)) / (1.0 + (speed / SLOW) ** 2) ** 2
+    return Wanted(states, targets, places, trusted[nearest], stands)
+
+
+class Seen:
+    """Where the points of a film are on the human of a scene."""
+
+    def __init__(self, human: Body, figure: Figure, proportions: np.ndarray) -> None:
+        """human: as it is simulated, which may be of other sizes than the figure of these proportions."""
+        sizes = np.asarray(figure.scaled(jnp.asarray(proportions)), float)
+        self.links, local = np.array([figure.anchors[name][0] for name in POINTS]), []
+        for name in POINTS:
+            link, at = figure.anchors[name]
+            axis, joint = human.links[link].axis, human.joints[link - 1].child_anchor
+            own, other = (
+                [anchor(point, np.array(length), np.array(radius), axis) for point in (joint, at)]
+                for length, radius in (human.sizes[link, :2], sizes[link])
+            )
+            local.append(own[0] + other[1] - other[0])  # as far from its joint as on the figure
+        self.local = np.array(local)
+        self.torso = figure.torso
+        self.ahead = proportions[-1] * sizes[figure.torso, 0] * np.array(["shoulder" in name for name in POINTS], float)
+
+    def points(self, states: Any) -> Any:
+        """Points (*, P, 3) [m] of states (*, L, 13)."""
+        turned = matrix(packed.orientation(states))
+        found = packed.position(states)[..., self.links, :]
+        found = found + jnp.einsum(
+            "...pij,pj->...pi", turned[..., self.links, :, :], jnp.asarray(self.local, states.dtype)
+        )
+        return found + jnp.asarray(self.ahead, states.dtype)[:, None] * turned[..., self.torso, None, :, 0]
+
+
+def terms_of(seen: Seen, camera: Camera, sigma: float, dt: float) -> tuple[CostTerm, ...]:
+    """The named costs of a candidate."""
+    feet = np.array(FEET)
+
+    def image(states: Array, controls: Array, context: Wanted) -> Array:
+        apart = (camera.project(seen.points(states)) - context.places) / sigma
+        return (jnp.sqrt(context.weights)[..., None] * jnp.clip(apart, -30.0, 30.0)).reshape(len(states), -1)
+
+    def near(states: Array, controls: Array, context: Wanted) -> Array:
+        return ((packed.position(states) - context.states[..., packed.POSITION]) / NEAR).reshape(len(states), -1)
+
+    def pace(states: Array, controls: Array, context: Wanted) -> Array:
+        return ((packed.velocity(states) - context.states[..., packed.VELOCITY]) / PACE).reshape(len(states), -1)
+
+    def slip(states: Array, controls: Array, context: Wanted) -> Array:
+        points = seen.points(states)[:, feet]
+        moved = (points[1:] - points[:-1]) / (dt * STILL)
+        return (context.stands[1:, :, None] * moved).reshape(len(moved), -1)
+
+    def effort(states: Array, controls: Array, context: Wanted) -> Array:
+        return (controls - context.targets).reshape(len(controls), -1)
+
+    def smooth(states: Array, controls: Array, context: Wanted) -> Array:
+        second = controls[2:] - 2.0 * controls[1:-1] + controls[:-2]
+        return (second / 0.02).reshape(len(second), -1)
+
+    return (
+        CostTerm("image", image, quadratic, 0.3),
+        CostTerm("near", near, quadratic, 1.0),
+        CostTerm("pace", pace, quadratic, 1.0),
+        CostTerm("slip", slip, quadratic, 0.3),
+        CostTerm("effort", effort, quadratic, 0.5),
+        CostTerm("smooth", smooth, quadratic, 0.1),
+    )
+
+
+def planner_of(
+    scene: Scene, seen: Seen, camera: Camera, sigma: float, dynamics: Dynamics, optimizers: tuple[Optimizer, ...]
+) -> Planner:
+    bounds = np.array([(motor.lower, motor.upper) for motor in scene.motors])
+    return Planner(
+        dynamics, terms_of(seen, camera, sigma, scene.dt), HORIZON, KNOTS, scene.dt, SEARCH * stray(scene),
+        usable(dynamics, optimizers), bounds[:, 0], bounds[:, 1],
+    )  # fmt: skip
+
+
+def started(scene: Scene, wanted: Wanted) -> np.ndarray:
+    """The state (L, 13) in which the execution begins: the kinematic start's, on the ground."""
+    human, state = scene.bodies[0], wanted.states[0].copy()
+    sunk = clearance(human, state[None], human.sizes[None])[0]
+    state[:, 2] -= min(sunk, 0.0)
+    return state
+
+
+def fit(
+    scene: Scene, planner: Planner, wanted: Wanted, state: np.ndarray, seed: int = 0,
+    observe: Callable[[Execution], None] = lambda execution: None, every: int = EVERY,
+) -> Execution:  # fmt: skip
+    """Plan and execute in the truth."""
+    steps = len(wanted.states) - 1
+
+    def window(step: int) -> Window:
+        after = np.minimum(step + 1 + np.arange(HORIZON), steps)
+        now = np.minimum(step + np.arange(HORIZON), steps)
+        context = Wanted(*(each[after] for each in wanted))._replace(targets=wanted.targets[now])
+        return Window(wanted.targets[now], context)
+
+    return execute(
+        Truth(scene, 1), state, [Phase(planner, planner, every, window)], steps, jax.random.key(seed), scene.dt, observe
+    )

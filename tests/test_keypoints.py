@@ -1,0 +1,214 @@
+"""Keypoints: the camera, the figure that is laid over them, what is told of a reconstruction, and its equations."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from larp_model.bodies import human_and_ball
+from larp_model.scene import Scene
+from larp_model.truth.mujoco import closed
+from tasks.keypoints import camera as cameras
+from tasks.keypoints import filmed, lift, metrics, physical
+from tasks.keypoints.banded import Banded
+from tasks.keypoints.figure import SHARED, Figure, Pose
+from tasks.keypoints.points import POINTS, Keypoints
+from tasks.motions.references import embedded
+
+SIZE = (1000.0, 800.0)
+seeds = st.integers(0, 2**31)
+
+
+def random_pose(random: np.random.Generator, figure: Figure, frames: int) -> Pose:
+    share = random.uniform(0.0, 1.0, (frames, *figure.lower.shape))
+    turn = Rotation.random(frames, rng=random).as_matrix()
+    return Pose(random.standard_normal((frames, 3)), turn, figure.lower + share * (figure.upper - figure.lower))
+
+
+@pytest.fixture(scope="module")
+def kick() -> np.ndarray:
+    """Points (T, P, 3) of the embedded kick, 50 frames a second, until after the strike."""
+    reference, figure = embedded(human_and_ball()), lift.figure()
+    points = physical.Seen(figure.body, figure, np.zeros(SHARED))
+    states = reference.states[: reference.strike + 40 : 2, : len(figure.body.links)]
+    return np.asarray(points.points(states.astype(np.float32)), float)
+
+
+def film_of(points: np.ndarray, seed: int, noise: filmed.Noise = filmed.USUAL) -> tuple[Keypoints, cameras.Camera]:
+    random = np.random.default_rng(seed)
+    lens = filmed.camera_around(random, points)
+    return filmed.seen(random, lens, points, 50.0, noise), lens
+
+
+class TestCamera:
+    @given(seeds)
+    def test_what_lies_on_a_places_ray_is_projected_onto_the_place(self, seed: int) -> None:
+        random = np.random.default_rng(seed)
+        lens = cameras.looking(random.uniform(-5, 5, 3) + np.array([0, 0, 6]), random.uniform(-1, 1, 3), 700.0, SIZE)
+        places = random.uniform(0.0, 800.0, (7, 2))
+        points = lens.position + random.uniform(0.5, 20.0, (7, 1)) * lens.ray(places)
+        np.testing.assert_allclose(lens.project(points), places, atol=1e-6)
+
+    def test_it_sees_what_it_looks_at_in_the_middle_and_what_is_above_it_higher(self) -> None:
+        lens = cameras.looking(np.array([4.0, 1.0, 1.5]), np.array([0.0, 0.0, 1.0]), 900.0, SIZE)
+        middle, above = lens.project(np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.3]]))
+        np.testing.assert_allclose(middle, (500.0, 400.0))
+        assert abs(above[0] - 500.0) < 1e-6 and above[1] < 400.0
+
+    def test_a_file_says_all_or_leaves_where_it_stands_open(self, tmp_path: Path) -> None:
+        path = tmp_path / "camera.json"
+        path.write_text(json.dumps({"size": [1000, 800], "field_of_view": 90.0}))
+        lens, known = cameras.load(path)
+        assert not known and lens.focal == pytest.approx(500.0)
+        path.write_text(json.dumps({"focal": 800.0, "position": [4, 0, 2], "look_at": [0, 0, 1], "centre": [490, 410]}))
+        lens, known = cameras.load(path, SIZE)
+        assert known and lens.centre.tolist() == [490.0, 410.0] and lens.position.tolist() == [4.0, 0.0, 2.0]
+
+    @pytest.mark.parametrize(
+        ("given", "said"),
+        [
+            ("[1]", "needs an object"),
+            ("{", "is no JSON file"),
+            ('{"size": [10, 10], "focus": 3}', "did you mean 'focal'"),
+            ('{"focal": 500}', "has no size"),
+            ('{"size": [10, 0]}', "needs numbers above 0"),
+            ('{"size": [10, 10], "focal": 0}', "focal is 0, but must be above 0"),
+            ('{"size": [10, 10], "focal": 5, "field_of_view": 60}', "has both"),
+            ('{"size": [10, 10], "field_of_view": 170}', "must be from 10 to 150 degrees"),
+            ('{"size": [10, 10], "position": [1, 2, 3]}', "needs both or neither"),
+            ('{"size": [10, 10], "position": [1, 2, -3], "look_at": [0, 0, 0]}', "must be above the ground"),
+            ('{"size": [10, 10], "position": [0, 0, 3], "look_at": [0, 0, 0]}', "which way is up"),
+            ('{"size": [10, NaN]}', "needs 2 finite numbers"),
+        ],
+    )
+    def test_what_it_cannot_be_is_refused_by_name(self, given: str, said: str, tmp_path: Path) -> None:
+        path = tmp_path / "camera.json"
+        path.write_text(given)
+        with pytest.raises(ValueError, match=r"camera|field_of_view|look_at") as refused:
+            cameras.load(path)
+        assert said in str(refused.value) and "\n" not in str(refused.value)
+
+
+class TestFigure:
+    @settings(max_examples=10)
+    @given(seeds)
+    def test_bones_are_as_long_in_every_pose(self, seed: int) -> None:
+        figure, random = lift.figure(), np.random.default_rng(seed)
+        proportions = 0.1 * random.standard_normal(SHARED)
+        points = figure.all_points(random_pose(random, figure, 5), proportions)
+        for one, other in (("hip", "knee"), ("knee", "ankle"), ("elbow", "wrist"), ("ankle", "toe")):
+            for side in ("left", "right"):
+                rows = [POINTS.index(f"{side}_{end}") for end in (one, other)]
+                lengths = np.linalg.norm(np.diff(points[:, rows], axis=1), axis=-1)
+                assert np.ptp(lengths) < 1e-5
+
+    @settings(max_examples=10)
+    @given(seeds)
+    def test_who_is_larger_as_a_whole_is_larger_in_every_part(self, seed: int) -> None:
+        figure, random = lift.figure(), np.random.default_rng(seed)
+        pose = random_pose(random, figure, 3)
+        larger = np.zeros(SHARED)
+        larger[0] = np.log(1.2)
+        small, large = (figure.all_points(pose, each) - pose.place[:, None] for each in (np.zeros(SHARED), larger))
+        np.testing.assert_allclose(large, 1.2 * small, atol=1e-5)
+
+    def test_its_points_are_where_the_simulated_human_has_them(self) -> None:
+        figure, random = lift.figure(), np.random.default_rng(3)
+        pose, proportions = random_pose(random, figure, 4), 0.05 * random.standard_normal(SHARED)
+        body = figure.of(proportions)
+        states = np.zeros((4, len(body.links), 13))
+        turns = [Rotation.from_matrix(pose.turn)]
+        for child, joint in enumerate(body.joints, start=1):
+            turns.append(turns[joint.parent] * Rotation.from_rotvec(pose.angles[:, child - 1]))
+        states[:, :, 3:7] = np.stack([each.as_quat(scalar_first=True) for each in turns], axis=1)
+        states[:, 0, :3] = pose.place
+        seen = physical.Seen(body, figure, proportions).points(closed(Scene((body,)), states).astype(np.float32))
+        np.testing.assert_allclose(seen, figure.all_points(pose, proportions), atol=1e-5)
+
+
+class TestMetrics:
+    @given(seeds)
+    def test_each_alignment_forgives_what_it_is_for(self, seed: int) -> None:
+        random = np.random.default_rng(seed)
+        true = random.standard_normal((4, len(POINTS), 3))
+        shifted = metrics.position_errors(true + random.standard_normal(3), true)
+        wandering = metrics.position_errors(true + random.standard_normal((4, 1, 3)), true)
+        turned = 1.3 * Rotation.random(rng=random).apply(true.reshape(-1, 3)).reshape(true.shape)
+        assert max(shifted.values()) < 1e-6
+        assert wandering["mpjpe_mm"] < 1e-6 < wandering["mpjpe_g_mm"]
+        assert metrics.position_errors(turned, true)["mpjpe_pa_mm"] < 1e-6
+
+    def test_a_steady_shift_is_no_error_of_velocity_and_jitter_is(self) -> None:
+        true = np.random.default_rng(0).standard_normal((5, len(POINTS), 3))
+        assert metrics.velocity_error(true + 1.0, true, 60.0) < 1e-9
+        assert metrics.velocity_error(true + 0.01 * true[::-1], true, 60.0) > 0.1
+
+    def test_feet_skate_where_they_slide_on_the_ground_alone(self) -> None:
+        points = np.ones((20, len(POINTS), 3))
+        points[:, metrics.FEET["left"], 2] = 0.01
+        assert metrics.foot_skate(points) == 0.0
+        points[:, :, 0] += 0.03 * np.arange(20)[:, None]
+        assert metrics.foot_skate(points) == 100.0
+        points[:, :, 2] += 0.2
+        assert metrics.foot_skate(points) == 0.0
+
+    def test_depth_in_the_ground_is_told(self) -> None:
+        points = np.ones((4, len(POINTS), 3))
+        points[0, metrics.FEET["left"], 2] = -0.04
+        assert metrics.off_the_ground(points) == {"sunk_mm": pytest.approx(10.0), "sunk": 25.0}
+
+
+class TestEquations:
+    @given(seeds)
+    def test_a_band_with_an_edge_is_solved_as_the_whole_matrix_is(self, seed: int) -> None:
+        random, (frames, size, shared, rows) = np.random.default_rng(seed), (6, 4, 3, 5)
+        band, whole, slope = Banded(frames, size, shared), np.zeros((27, 27)), np.zeros(27)
+        for offsets in ((0,), (0, 1), (0, 1, 2)):
+            length = frames - offsets[-1]
+            weights, residual = random.uniform(0.5, 2.0, (length, rows)), random.standard_normal((length, rows))
+            slopes = tuple((offset, random.standard_normal((length, rows, size + shared))) for offset in offsets)
+            band.add(weights, residual, slopes)
+            for frame in range(length):
+                jacobian = np.zeros((rows, 27))
+                for offset, each in slopes:
+                    begin = size * (frame + offset)
+                    jacobian[:, begin : begin + size] += each[frame, :, :size]
+                    jacobian[:, -shared:] += each[frame, :, size:]
+                whole += jacobian.T * weights[frame] @ jacobian
+                slope += jacobian.T @ (weights[frame] * residual[frame])
+        own, common = band.solved(0.1)
+        expected = -np.linalg.solve(whole + 0.1 * np.diag(np.diag(whole)), slope)
+        np.testing.assert_allclose(np.concatenate([own.ravel(), common]), expected, rtol=1e-3, atol=1e-5)
+
+
+class TestFilms:
+    def test_without_noise_a_film_shows_where_points_are(self, kick: np.ndarray) -> None:
+        film, lens = film_of(kick, 5, filmed.Noise(0.0, 0.0, 0.0))
+        np.testing.assert_allclose(film.places, lens.project(kick))
+        assert film.seen.all() and (film.places > 0.0).all() and (film.places < filmed.SIZE[0]).all()
+
+    def test_what_is_missed_has_no_confidence(self, kick: np.ndarray) -> None:
+        film, _ = film_of(kick, 5, filmed.Noise(4.0, 0.3, 0.1))
+        assert (np.isnan(film.places[..., 0]) == ~film.seen).all() and 0.1 < (~film.seen).mean() < 0.9
+
+    def test_a_figure_laid_over_a_kick_is_near_the_true_one(self, kick: np.ndarray) -> None:
+        film, lens = film_of(kick, 11)
+        lifted = lift.lift(film, lens)
+        found = lift.figure().all_points(lifted.pose, lifted.proportions)
+        errors = metrics.position_errors(found, kick)
+        assert errors["mpjpe_g_mm"] < 120.0 and errors["mpjpe_pa_mm"] < 60.0
+        assert lifted.error < 8.0 and metrics.foot_skate(found) <= 4.0
+
+    def test_a_camera_of_which_only_the_lens_is_known_is_found_with_the_motion(self, kick: np.ndarray) -> None:
+        film, lens = film_of(kick, 11)
+        lifted = lift.lift(film, cameras.held(lens.focal, filmed.SIZE), known=False)
+        found = lift.figure().all_points(lifted.pose, lifted.proportions)
+        errors = metrics.position_errors(found, kick)
+        assert errors["mpjpe_pa_mm"] < 70.0 and lifted.error < 8.0
+        assert 0.3 < lifted.camera.position[2] < 3.5
