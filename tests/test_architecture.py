@@ -135,6 +135,7 @@ ORDER = [
     "tasks.benchmarks.slopes",
     "tasks.benchmarks.stability",
     "tasks.benchmarks.page",
+    "tasks.benchmarks.pose",
     "tasks.benchmarks.__main__",
     "tasks.benchmarks",
     "tasks",

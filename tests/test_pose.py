@@ -11,6 +11,7 @@ import pytest
 
 from larp_model.bodies import human_and_ball
 from tasks import pose
+from tasks.benchmarks import pose as benchmark
 from tasks.command import run
 from tasks.keypoints import filmed, lift, metrics, physical
 from tasks.keypoints.figure import SHARED
@@ -85,6 +86,34 @@ def test_what_cannot_be_reconstructed_is_refused_in_one_line_and_nothing_is_writ
         run(pose.main, [str(path), "--out", str(out), *arguments])
     error = capsys.readouterr().err
     assert ended.value.code == 2 and said in error and error.count("\n") == 1 and not out.exists()
+
+
+def test_the_benchmark_tells_how_far_a_reconstruction_is_from_what_was_filmed(tmp_path: Path) -> None:
+    path = tmp_path / "pose.json"
+    benchmark.main(cameras=1, seconds=0.6, ways=("kinematic",), seed=3, json=path)
+    found = json.loads(path.read_text())
+    (row,) = found["rows"]
+    assert (
+        row["frames"] == 36
+        and row["clip"] == "embedded"
+        and found["means"]["kinematic"] == {name: row["kinematic"][name] for name in found["means"]["kinematic"]}
+    )
+    assert 1.0 < row["kinematic"]["mpjpe_pa_mm"] < 100.0
+    assert path.with_suffix(".png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"cameras": 0}, "cameras is 0"),
+        ({"seconds": 0.1}, "seconds is 0.1, but must be from 0.4 to 60"),
+        ({"ways": ("larp", "larp")}, "each once"),
+        ({"clips": (Path("nowhere.bvh"),)}, "clips is 'nowhere.bvh', but no such file exists"),
+    ],
+)
+def test_a_benchmark_that_makes_no_sense_is_refused(arguments: dict[str, Any], said: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=said):
+        benchmark.main(json=tmp_path / "pose.json", **arguments)
 
 
 def test_too_few_frames_are_refused(film: dict[str, Any]) -> None:

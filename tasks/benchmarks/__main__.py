@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from tasks.benchmarks import gap, kick, model, optimizers, page, reference, speed, stability, tradeoff
+from tasks.benchmarks import gap, kick, model, optimizers, page, pose, reference, speed, stability, tradeoff
 from tasks.command import run
 
 NAMED: dict[str, Callable[..., None]] = {
@@ -15,6 +15,7 @@ NAMED: dict[str, Callable[..., None]] = {
     "stability": stability.main,
     "reference": reference.main,
     "page": page.main,
+    "pose": pose.main,
 }
 
 

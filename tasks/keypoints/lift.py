@@ -6,13 +6,15 @@
              + |hinge(angles)|^2 + |S^(-1/2) (angles - m)|^2              joints bend as joints do, and as people's do
              + sum_i sqrt(1 + |p_i'' / s_i|^2)                            nothing jerks
              + sum_feet a_ft |p_f'|^2 + a_ft h_f^2 + |min(0, h_f)|^2      feet that stand do so on the ground, and stay
+             + a_t |c - p - c'' z / g|^2                                  whom no foot holds up falls over
         + |b / sigma_b|^2
 
 rho is Geman and McClure's, m and S are those of the project's own motions, a_ft says how much a foot looks as if it
-stood (both by iteratively reweighted least squares). One image leaves open who leans forwards and who backwards: so
-each frame is first solved alone from many headings and poses, and of what they lead to the sequence that moves least is
-taken (R. Bellman's dynamic programming). From there all frames are solved together by Levenberg and Marquardt's steps,
-whose matrix is a band with an edge: SciPy's banded Cholesky solves it.
+stood (both by iteratively reweighted least squares); c is the middle of the mass and p of the feet that stand.
+
+One image leaves open who leans forwards and who backwards: so each frame is first solved alone from many headings and
+poses, and of what they lead to the sequence that moves least is taken (R. Bellman's dynamic programming). From there
+all frames are solved together by Levenberg and Marquardt's steps, whose matrix is a band with an edge.
 """
 
 from __future__ import annotations
@@ -74,7 +76,7 @@ _SWAPS = (
 class Lifted(NamedTuple):
     """A figure in all frames.
 
-    pose: see `figure.Pose`. proportions: (1 + 9,), see `Figure`. camera: as given, or as estimated. error: of the
+    pose: see `figure.Pose`. proportions: (11,), see `Figure`. camera: as given, or as estimated. error: of the
     points that were seen [px], the median.
     """
 
@@ -128,7 +130,7 @@ def usual_poses() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     flat = angles.reshape(len(angles), -1)
     mean, covariance = flat.mean(axis=0), np.cov(flat.T) + WIDER**2 * np.eye(flat.shape[1])
     whitening = np.linalg.cholesky(np.linalg.inv(covariance)).T
-    chosen = [mean]  # farthest points first: poses unlike each other
+    chosen = [mean]  # poses unlike each other, but not the oddest
     nearest = np.linalg.norm((flat - chosen[0]) @ whitening.T, axis=1)
     while len(chosen) < POSES:
         chosen.append(flat[np.argsort(nearest)[int(0.9 * len(flat))]])
@@ -145,10 +147,9 @@ def _tilted(camera: Camera, unknown: Array) -> Camera:
 
 def _moved(body: Figure, camera: Camera, turn: Array, change: Array, shared: Array) -> tuple[Array, Array]:
     """Points (P, 3) [m] and their places (P, 2) [px]; change: place, turn, angles; shared: proportions, camera."""
-    count = SHARED
     turned = matrix(from_rotation_vector(change[3:6])) @ turn
-    points = body.points(change[:3], turned, change[6:].reshape(-1, 3), shared[:count])
-    return points, _tilted(camera, shared[count : count + 3]).project(points)
+    points = body.points(change[:3], turned, change[6:].reshape(-1, 3), shared[:SHARED])
+    return points, _tilted(camera, shared[SHARED : SHARED + 3]).project(points)
 
 
 class _Lifter:
@@ -174,7 +175,6 @@ class _Lifter:
 
         Returns turns, changes and costs (F, S).
         """
-
         seen = _Seen(*(np.nan_to_num(each[frames]) for each in (self.keypoints.places, self.keypoints.confidence)))
         given = jax.tree.map(partial(jnp.asarray, dtype=jnp.float32), (begin, turns, seen, free, shared))
         changes, costs = map(np.asarray, self.improved(*given))
@@ -304,44 +304,43 @@ class _Lifter:
 
     # All frames together.
 
-    def solved(self, tell: Callable[[float], None]) -> tuple[Pose, np.ndarray]:
+    def solved(self) -> tuple[Pose, np.ndarray]:
         """The pose and what is shared."""
-        pose, shared = self.together(self.first(), np.zeros(len(self.shared_sigma)), STEPS // 2, tell)
+        pose, shared = self.together(self.first(), np.zeros(len(self.shared_sigma)), STEPS // 2)
         names = [self.figure.body.links[child].name for child, _, _ in self.figure.body.motors]
         for side in SIDES:
             for limb in LIMBS:
                 pose = self.rethought(pose, shared, tuple(names.index(f"{side}_{each}") for each in limb))
-        return self.together(pose, shared, STEPS, tell)
+        return self.together(pose, shared, STEPS)
 
-    def together(
-        self, pose: Pose, shared: np.ndarray, steps: int, tell: Callable[[float], None]
-    ) -> tuple[Pose, np.ndarray]:
-        """The pose and what is shared, after so many steps."""
-        damping = 1e-2
-        places, confidence = self.keypoints.places.copy(), self.keypoints.confidence.copy()
-        for number in range(steps):
-            if number in (steps // 3, 2 * steps // 3):
+    def together(self, pose: Pose, shared: np.ndarray, steps: int) -> tuple[Pose, np.ndarray]:
+        """The pose and what is shared, after so many steps at most."""
+        places, confidence = self.keypoints.places, self.keypoints.confidence
+        known = len(pose.place) / self.keypoints.rate / self.shared_sigma**2
+        for again in range(3):
+            damping = 1e-2
+            if again:
                 places, confidence = self._unswapped(pose, shared, places, confidence)
-            terms = self.terms(pose, shared, places, confidence)
-            known = len(pose.place) / self.keypoints.rate / self.shared_sigma**2
-            normal = Banded(len(pose.place), 6 + 3 * self.figure.joints, len(shared))
+            for _ in range(steps // 3):
+                terms = self.terms(pose, shared, places, confidence)
+                normal = Banded(len(pose.place), 6 + 3 * self.figure.joints, len(shared))
 
-            def cost(pose: Pose, shared: np.ndarray, terms: list[Term] = terms, known: np.ndarray = known) -> float:
-                now = self.now(pose, shared)
-                return sum(float(np.sum(w * of(now) ** 2)) for w, of, _ in terms) + float(known @ shared**2)
+                def cost(now: Now, shared: np.ndarray, terms: list[Term] = terms) -> float:
+                    return sum(float(np.sum(w * of(now) ** 2)) for w, of, _ in terms) + float(known @ shared**2)
 
-            here, before = self.now(pose, shared), cost(pose, shared)
-            for weights, residual, slopes in terms:
-                normal.add(weights, residual(here), slopes)
-            normal.share(known, shared)
-            for _ in range(8):
-                change, common = normal.solved(damping)
-                there = _after(pose, change)
-                if cost(there, shared + common) < before:
-                    pose, shared, damping = there, shared + common, max(0.3 * damping, 1e-6)
-                    break
-                damping *= 5.0
-            tell((number + 1) / steps)
+                here = self.now(pose, shared)
+                for weights, residual, slopes in terms:
+                    normal.add(weights, residual(here), slopes)
+                normal.share(known, shared)
+                for _ in range(8):
+                    change, common = normal.solved(damping)
+                    there = _after(pose, change)
+                    if cost(self.now(there, shared + common), shared + common) < cost(here, shared):
+                        pose, shared, damping = there, shared + common, max(0.3 * damping, 1e-6)
+                        break
+                    damping *= 5.0
+                else:
+                    break  # nothing gains any more
         return pose, shared
 
     def _unswapped(
@@ -498,16 +497,13 @@ def _between(frames: np.ndarray, changes: np.ndarray, turns: np.ndarray, count: 
     return Pose(mix(changes[:, :3]), between.as_matrix(), mix(changes[:, 6:]).reshape(count, -1, 3))
 
 
-def lift(
-    keypoints: Keypoints, camera: Camera, known: bool = True, tell: Callable[[float], None] = lambda share: None
-) -> Lifted:
-    """The figure in all frames.
+def lift(keypoints: Keypoints, camera: Camera, known: bool = True) -> Lifted:
+    """The figure in all frames, of which the first and the last show most of a person.
 
     known: whether it is known where the camera stands; else its tilt and height are estimated, from the given ones on.
-    tell: called with the share that is done.
     """
     lifter = _Lifter(keypoints, camera, known)
-    pose, shared = lifter.solved(tell)
+    pose, shared = lifter.solved()
     apart = np.linalg.norm(lifter.now(pose, shared).places - keypoints.places, axis=-1)
     if not known:
         tilted = _tilted(camera, jnp.asarray(shared[SHARED : SHARED + 3]))
