@@ -33,7 +33,7 @@ from tasks.keypoints.points import Keypoints
 from tasks.models import ROWS, DynamicsName
 from tasks.scenarios import ANY_HUMAN
 
-# Of each plan; several rounds of sampling do no better, for ten times as many candidates.
+# Of each plan.
 STEPS = GaussNewton(rounds=2, directions=32)
 # Of states and controls [s], as every scene's by default.
 DT = 0.01

@@ -19,15 +19,12 @@ PROPORTIONS = (
     ("pelvis", 0), ("torso", 0), ("torso", 1), ("head", 0),
     ("upper_arm", 0), ("lower_arm", 0), ("thigh", 0), ("shin", 0), ("foot", 0),
 )  # fmt: skip
-# Where each point is on its link, as a joint's anchor: along its axis in half-lengths, across it in radii. Shoulders,
-# elbows, hips, knees and ankles are joints; a wrist is where forearms end (0.146 of a height, D. Winter).
+# Points that are joints, by the link that each carries.
+JOINTS = {"shoulder": "upper_arm", "elbow": "lower_arm", "hip": "thigh", "knee": "shin", "ankle": "foot"}
+# Where the others are on their links, as joints' anchors are: along the axis in half-lengths, across it in radii. A
+# wrist is where forearms end (0.146 of a height, D. Winter).
 ON_LIMBS: dict[str, tuple[str, Vector]] = {
-    "shoulder": ("upper_arm", (0.0, 0.0, 1.1)),
-    "elbow": ("lower_arm", (0.0, 0.0, 1.0)),
     "wrist": ("lower_arm", (0.0, 0.0, -0.7)),
-    "hip": ("thigh", (0.0, 0.0, 1.35)),
-    "knee": ("shin", (0.0, 0.0, 1.35)),
-    "ankle": ("foot", (-0.7, 0.0, 0.6)),
     "heel": ("foot", (-1.3, 0.0, -0.6)),
     "toe": ("foot", (1.35, 0.0, -0.6)),
 }
@@ -56,11 +53,13 @@ class Figure:
         self.body = human()
         self.sizes = self.body.sizes
         names = [link.name for link in self.body.links]
-        self.anchors = {name: (names.index("head"), at) for name, at in ON_HEAD.items()} | {
-            f"{side}_{limb}": (names.index(f"{side}_{link}"), at)
-            for limb, (link, at) in ON_LIMBS.items()
-            for side in SIDES
-        }
+        self.anchors = {name: (names.index("head"), at) for name, at in ON_HEAD.items()}
+        for side in SIDES:
+            for limb, segment in JOINTS.items():
+                link = names.index(f"{side}_{segment}")
+                self.anchors[f"{side}_{limb}"] = link, self.body.joints[link - 1].child_anchor
+            for limb, (segment, at) in ON_LIMBS.items():
+                self.anchors[f"{side}_{limb}"] = names.index(f"{side}_{segment}"), at
         self.joints, self.torso = len(self.body.joints), names.index("torso")
         motors = [motor for _, _, motor in self.body.motors]
         self.lower = np.array([motor.lower for motor in motors])

@@ -375,7 +375,7 @@ class _Lifter:
         apart = image(now).reshape(frames, count, 2)
         trusted = each * confidence / (1.0 + (apart**2).sum(axis=-1) / OUTLIER**2) ** 2
         quick = np.array([QUICK.get(name.partition("_")[2], TRUNK) for name in POINTS]) / rate**2
-        jerk = each / quick**2 / np.sqrt(1.0 + (seconds(now.points) ** 2).sum(axis=-1) / quick**2)
+        jerk = each / quick**2 / np.sqrt(1.0 + (second_differences(now.points) ** 2).sum(axis=-1) / quick**2)
         feet, height = now.points[:, FEET], now.heights
         speed = np.linalg.norm(np.diff(feet, axis=0), axis=-1) * rate
         speed = np.minimum(np.concatenate([speed[:1], speed]), np.concatenate([speed, speed[-1:]]))
@@ -388,7 +388,7 @@ class _Lifter:
         return [
             Term(np.repeat(trusted, 2, axis=1), image, ((0, y / self.sigma),)),
             Term(
-                np.repeat(jerk, 3, axis=1), lambda now: seconds(now.points).reshape(frames - 2, -1),
+                np.repeat(jerk, 3, axis=1), lambda now: second_differences(now.points).reshape(frames - 2, -1),
                 ((0, x[:-2]), (1, -2.0 * x[1:-1]), (2, x[2:])),
             ),
             Term(
@@ -420,7 +420,7 @@ class _Lifter:
         def unborne(now: Now) -> np.ndarray:
             middle = np.einsum("p,tpx->tx", mass, now.points[..., :2])
             held = (share[..., None] * now.points[1:-1, FEET, :2]).sum(axis=1)
-            return middle[1:-1] - held - pace * seconds(middle)
+            return middle[1:-1] - held - pace * second_differences(middle)
 
         by_point = x.reshape(len(x), len(POINTS), 3, -1)[:, :, :2]
         of_middle = np.einsum("p,tpxd->txd", mass, by_point)
@@ -470,7 +470,7 @@ class _Lifter:
         return slopes
 
 
-def seconds(values: np.ndarray) -> np.ndarray:
+def second_differences(values: np.ndarray) -> np.ndarray:
     """Second differences (T - 2, ...) along the frames."""
     return values[2:] - 2.0 * values[1:-1] + values[:-2]
 

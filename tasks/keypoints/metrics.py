@@ -51,20 +51,17 @@ def procrustes(found: np.ndarray, true: np.ndarray) -> np.ndarray:
 
 
 def velocity_error(found: np.ndarray, true: np.ndarray, rate: float) -> float:
-    """Mean error [m/s] of the joints' velocities of points (T, P, 3) [m], aligned by the pelvis of each frame.
-
-    The paper gives no unit; DiffPhy's are of metres a frame.
-    """
+    """Mean error [m/s] of the joints' velocities of points (T, P, 3) [m], aligned by the pelvis of each frame."""
     both = ((each - pelvis(each))[:, JOINTS] for each in (found, true))
     one, other = (rate * np.diff(each, axis=0) for each in both)
     return float(np.linalg.norm(one - other, axis=-1).mean())
 
 
-def foot_skate(points: np.ndarray, ground: float = 0.0) -> float:
+def foot_skate(points: np.ndarray) -> float:
     """Share of frames [%] in which a foot in contact moves by more than 2 cm to the next; points (T, P, 3) [m]."""
     skating = np.zeros(len(points) - 1, bool)
     for rows in FEET.values():
-        low: np.ndarray = np.all(points[:, rows, 2] - ground < CONTACT, axis=1)
+        low: np.ndarray = np.all(points[:, rows, 2] < CONTACT, axis=1)
         moved = np.linalg.norm(np.diff(points[:, rows].mean(axis=1), axis=0), axis=-1)
         skating = np.logical_or(skating, low[:-1] & low[1:] & (moved > SKATE))
     return 100.0 * float(skating.mean())

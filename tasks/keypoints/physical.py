@@ -2,6 +2,7 @@
 
     minimise over theta   w_2 sum_i,t c_it |project(p_i(t)) - y_it|^2      points lie where the detector saw them
                         + w_x sum_i,t |x_i(t) - x_i^start(t)|^2           links stay near the kinematic start
+                        + w_v sum_i,t |x_i'(t) - x_i^start'(t)|^2         and move as fast
                         + w_s sum_f,t a_ft |p_f'(t)|^2                    feet that stand stay
                         + w_e |Q - Q^start|^2                             joint targets stay near the start's
                         + w_d |Q''|^2                                     and are smooth
@@ -13,7 +14,6 @@ or MuJoCo; what comes out is what MuJoCo did.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -31,7 +31,7 @@ from mpc.loop import Execution, Phase, Window, execute
 from tasks.data import stray
 from tasks.keypoints.camera import Camera
 from tasks.keypoints.figure import Figure, Pose
-from tasks.keypoints.lift import FEET, PIXELS, SLOW, Lifted
+from tasks.keypoints.lift import FEET, OUTLIER, PIXELS, SLOW, Lifted
 from tasks.keypoints.points import POINTS, Keypoints
 from tasks.motions.references import clearance
 from tasks.presets import usable
@@ -39,7 +39,8 @@ from tasks.presets import usable
 HORIZON, KNOTS, EVERY = 50, 11, 5
 # Spread of a first plan, as a share of how far the training data strays from its motions.
 SEARCH = 0.5
-# What counts as one unit of each cost: distances from the kinematic start [m], a standing foot's speed [m/s].
+# What counts as one unit of each cost: distances [m] and velocities [m/s] off the kinematic
+# start's, a standing foot's speed [m/s].
 NEAR, PACE, STILL = 0.05, 0.5, 0.3
 
 
@@ -87,7 +88,7 @@ def wanted_of(scene: Scene, figure: Figure, lifted: Lifted, keypoints: Keypoints
     seen = np.nan_to_num(keypoints.places)
     found = lifted.camera.project(figure.all_points(lifted.pose, lifted.proportions))
     apart = np.linalg.norm(found - seen, axis=-1) / (PIXELS * max(keypoints.size or 2.0 * lifted.camera.centre))
-    trusted = keypoints.confidence / (1.0 + (apart / 6.0) ** 2) ** 2
+    trusted = keypoints.confidence / (1.0 + (apart / OUTLIER) ** 2) ** 2
     nearest = np.minimum(np.rint(times * keypoints.rate).astype(int), len(keypoints) - 1)
     both = np.where(keypoints.seen[..., None], seen, found).reshape(len(begin), -1)
     places = np.stack([np.interp(times, begin, each) for each in both.T], axis=1).reshape(len(times), -1, 2)
@@ -165,6 +166,7 @@ def terms_of(seen: Seen, camera: Camera, sigma: float, dt: float) -> tuple[CostT
 def planner_of(
     scene: Scene, seen: Seen, camera: Camera, sigma: float, dynamics: Dynamics, optimizers: tuple[Optimizer, ...]
 ) -> Planner:
+    """A planner of these costs; sigma: standard deviation of the keypoints [px]."""
     bounds = np.array([(motor.lower, motor.upper) for motor in scene.motors])
     return Planner(
         dynamics, terms_of(seen, camera, sigma, scene.dt), HORIZON, KNOTS, scene.dt, SEARCH * stray(scene),
@@ -181,10 +183,9 @@ def started(scene: Scene, wanted: Wanted) -> np.ndarray:
 
 
 def fit(
-    scene: Scene, planner: Planner, wanted: Wanted, state: np.ndarray, seed: int = 0,
-    observe: Callable[[Execution], None] = lambda execution: None, every: int = EVERY,
+    scene: Scene, planner: Planner, wanted: Wanted, state: np.ndarray, seed: int = 0
 ) -> Execution:  # fmt: skip
-    """Plan and execute in the truth."""
+    """Plan and execute in the truth, from a state (L, 13) on, until what is wanted ends."""
     steps = len(wanted.states) - 1
 
     def window(step: int) -> Window:
@@ -193,6 +194,5 @@ def fit(
         context = Wanted(*(each[after] for each in wanted))._replace(targets=wanted.targets[now])
         return Window(wanted.targets[now], context)
 
-    return execute(
-        Truth(scene, 1), state, [Phase(planner, planner, every, window)], steps, jax.random.key(seed), scene.dt, observe
-    )
+    phase = Phase(planner, planner, EVERY, window)
+    return execute(Truth(scene, 1), state, [phase], steps, jax.random.key(seed), scene.dt)
