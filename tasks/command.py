@@ -33,7 +33,7 @@ def remember_compilations() -> None:
     """Keep compiled planners in the user's cache folder, so that the second run starts at once."""
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     jax.config.update("jax_compilation_cache_dir", str(base / "larp-mpc"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
 class Teller:

@@ -56,7 +56,7 @@ def _found(rounds: int, around: int) -> Stage:
 # over 64 others worse.
 PresetName = Literal["fast", "balanced", "accurate"]
 PRESETS: dict[str, Preset] = {
-    "fast": Preset(_found(4, 8), (GaussNewton(rounds=1),), every=5),
+    "fast": Preset(_found(4, 8), (GaussNewton(rounds=1),), every=5, stand=(replace(STAND, rounds=1),)),
     "balanced": Preset(_found(12, 16), (GaussNewton(rounds=1),), every=1),
     "accurate": Preset(_found(12, 16), (GaussNewton(rounds=1),), every=5, verify=(8, 3)),
 }
