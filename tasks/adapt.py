@@ -31,21 +31,21 @@ from larp_model.truth.episodes import Episodes
 from tasks.command import remember_compilations, run
 from tasks.data import STEPS, WINDOWS, contact_episodes, random_episodes
 from tasks.kick import Kick
-from tasks.models import learned_models
 from tasks.scenarios import ANY_HUMAN
 from tasks.task import HEIGHT
-from tasks.train import IMPACTS, OVER_MECHANICS, planned_episodes
+from tasks.train import IMPACTS, OVER_MECHANICS
+from tasks.tried import tried_episodes
 
 # Episodes that weights are checked on, and those drawn at a time.
 HELD_OUT, DRAWN = 64, 256
 # Shares of the time: random truth, random truth of the strike alone, and what the planner tries; of what is then left,
 # the swing before the impact.
-TRUTH, STRIKES, PLANS, SWING = 0.1, 0.15, 0.15, 0.4
+TRUTH, STRIKES, PLANS, SWING = 0.08, 0.1, 0.2, 0.4
 # Steps of episodes of the strike alone, and of those from just before a recorded contact. Different strikes are what
 # impacts are learned from: from a few thousand, each disturbed, weights learn those few.
 STRIKE, IMPACT = 14, 6
-# Of each plan so many candidates, and more kicks than are planned in any time.
-ELITES, KICKS = 8, 100
+# Of each plan so many of what it tried, and more kicks than are planned in any time.
+TRIED, KICKS = 128, 1000
 # The check at the end [s], and the least that is worth beginning [min].
 CHECKING, LEAST = 20.0, 2.0
 # Learning rate of a swing that has been learned already, and more updates than fit into any time.
@@ -154,10 +154,10 @@ def main(
         return truth_episodes.join(parts)
 
     long, strikes = drawn(STEPS, TRUTH, seed), drawn(STRIKE, STRIKES, 2_000_000 + seed)
-    tried, _ = planned_episodes(kick, learned_models(scene, model, start, "start"), KICKS, ELITES, seed, PLANS * whole)
+    tried = tried_episodes(kick, KICKS, TRIED, seed, PLANS * whole)
     impacts = [
-        contact_episodes(scene, source, len(strikes.states) // share, seed + number, IMPACT)[0]
-        for number, (source, share) in enumerate(((strikes, 1), (long, 2), (tried, 4)))
+        contact_episodes(scene, source, round(share * len(strikes.states)), seed + number, IMPACT)[0]
+        for number, (source, share) in enumerate(((strikes, 0.5), (long, 0.25), (tried, 1.0)))
     ]
     counts = [sum(len(each.states) for each in kind) for kind in ((long,), (tried,), (strikes, *impacts))]
     tell("{} random episodes, {} of plans, {} of strikes".format(*counts))

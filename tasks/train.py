@@ -39,11 +39,14 @@ from tasks.data import contact_episodes, random_task
 from tasks.kick import Kick
 from tasks.models import WEIGHTS, Models, learned_models
 from tasks.presets import Preset
-from tasks.scenarios import Scenario, scenario, trained_at
+from tasks.scenarios import ANY_HUMAN, Scenario, scenario, trained_at
+from tasks.tried import tried_by_many
 
 EVALUATION_SEED = 1
 # Short episodes of impacts for each long one.
 CONTACTS = 3
+# Of each kick's plan, so many of what it tried in the truth.
+TRIES = 96
 # How the planner searches for the candidates that it is trained on: by sampling, for a step by gradients tries few.
 CANDIDATES = Preset((CEM(256, 10, 24, 1.0),), (CEM(128, 3, 24, 1.0),), every=4)
 # Errors of a velocity count linearly: the median launch matters, not the worst.
@@ -57,7 +60,7 @@ class Stage(NamedTuple):
     """
 
     name: str
-    adds: Literal["", "planned", "contacts"]
+    adds: Literal["", "planned", "contacts", "tried"]
     recipe: training.Recipe
     uses: tuple[str, ...] = ("",)
 
@@ -85,6 +88,8 @@ GENERAL = (Stage("steps", "", OVER_MECHANICS),)
 # A struck ball is its launch, and nothing blurs that; what else is struck is a body like others, whose response counts
 # like the push.
 STRIKING_BALLS = (*GENERAL, Stage("impacts", "", IMPACTS))
+# What planners do with a ball, they do where random motion seldom comes.
+TRIED = (Stage("tried", "tried", replace(IMPACTS, updates=8000, learning_rate=5e-4)),)
 STRIKING = (*GENERAL, Stage("impacts", "", replace(IMPACTS, only=("contact", "response"), loss=LOSS)))
 # One leg on the other, the body's own motion left as it is.
 LEGS = (
@@ -118,6 +123,7 @@ def stages_of(chosen: Scenario) -> tuple[Stage, ...]:
     return (
         *(STRIKING_BALLS if balls else STRIKING),
         *(LEGS if scene.within.pairs else ()),
+        *(TRIED if chosen.name in ANY_HUMAN.values() else ()),
     )
 
 
@@ -235,7 +241,9 @@ def main(
         if stage.name in done:
             continue
         later = seed + 1000 * number
-        if stage.adds and kick is not None and learned is not None:
+        if stage.adds == "tried":
+            add(stage.name, partial(tried_by_many, chosen.scene, tasks, TRIES, later))
+        elif stage.adds and kick is not None and learned is not None:
             models = learned_models(chosen.scene, model, learned, stage.name)
             last = [*sources.values()][-1]
             makers = {

@@ -111,6 +111,7 @@ ORDER = [
     "tasks.task",
     "tasks.live",
     "tasks.kick",
+    "tasks.tried",
     "tasks.keypoints.physical",
     "tasks.keypoints.picture",
     "tasks.keypoints",

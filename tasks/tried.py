@@ -1,0 +1,114 @@
+"""What the planner tries on the way to kicks, with the truth as its model: the strikes that weights must know well."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from larp_model import bodies
+from larp_model import state as packed
+from larp_model.scene import Scene
+from larp_model.truth.episodes import Episodes, join
+from larp_model.truth.mujoco import SUBSTEPS
+from mpc import Continued, GaussNewton, MujocoDynamics
+from mpc.dynamics import BatchedTruth
+from tasks.data import contact_episodes, random_task
+from tasks.kick import Kick
+from tasks.models import models_of
+from tasks.motions import key_poses, references, styles
+from tasks.motions.details import in_detail
+from tasks.motions.people import random_people
+from tasks.motions.references import Reference
+from tasks.task import Task
+
+# It steps as the presets do; after so many rounds most kicks hit.
+STEPS = GaussNewton(rounds=8, directions=24)
+# A bent kick is worth planning where it strikes in one of these steps, and drives the ball as fast as this [m/s].
+STRIKES, SPEED = (15, 60), 3.0
+# Steps of a bent kick; disturbed contacts that are drawn of each try.
+LENGTH, CONTACTS = 120, 2
+
+
+class Watched:
+    """A truth that keeps what it rolled out: states (N, L, 13), controls (N, H, J, 3) [rad], states after each step."""
+
+    def __init__(self, truth: BatchedTruth) -> None:
+        self.truth = truth
+        self.seen: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+
+    @property
+    def batch(self) -> int:
+        """How many rows it rolls out side by side."""
+        return self.truth.batch
+
+    def rollout(self, states: np.ndarray, controls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `mpc.dynamics.BatchedTruth`."""
+        after, finite = self.truth.rollout(states, controls)
+        self.seen.append((states[finite], controls[finite], after[finite]))
+        return after, finite
+
+
+def tried_episodes(task: Task, kicks: int, each: int, seed: int, seconds: float = math.inf) -> Episodes:
+    """Of the first plans of so many random kicks, `each` of what they tried, as long as a plan.
+
+    seconds: after which no other kick is begun.
+    """
+    random, began = np.random.default_rng(seed), time.perf_counter()
+    whole = models_of(task.scene, "mujoco", Path(), SUBSTEPS).whole
+    assert isinstance(whole, Continued) and isinstance(whole.dynamics, MujocoDynamics)
+    watched = Watched(whole.dynamics.truth)
+    planner = task.planner(replace(whole, dynamics=MujocoDynamics(watched)), (STEPS,))
+    parts = []
+    for index in range(kicks):
+        target, shift = random_task(random)
+        state, wanted = task.start(), task.window(target)(0)
+        state[task.ball, :2] += shift
+        planner.step(planner.init(jax.random.key(seed + index)), state, wanted.controls, wanted.context)
+        states, controls, after = (np.concatenate(rows) for rows in zip(*watched.seen, strict=True))
+        watched.seen.clear()
+        rows = random.choice(len(states), min(each, len(states)), replace=False)
+        whole_way = np.concatenate([states[rows, None], after[rows]], axis=1)
+        parts.append((whole_way.astype(np.float32), controls[rows].astype(np.float32)))
+        if time.perf_counter() - began > seconds:
+            break
+    states, controls = (np.concatenate(rows) for rows in zip(*parts, strict=True))
+    count, links = len(states), len(task.scene.links)
+    sizes = np.broadcast_to(task.scene.morphology.astype(np.float32), (count, links, 3))
+    return Episodes(states, controls, np.zeros((*controls.shape[:2], links, 3), np.float32), sizes)
+
+
+def tried_by_many(scene: Scene, kicks: int, each: int, seed: int) -> tuple[Episodes, int]:
+    """Contacts of what is tried on the way to kicks of many humans of every size, each near a bent kick of its own.
+
+    Returns short episodes, some `CONTACTS` of each try (see `data.contact_episodes`), and how many were dropped.
+    """
+    random, found, dropped = np.random.default_rng(seed), list[Episodes](), 0
+    while len(found) < kicks:
+        own = scene.sized(random_people(random, scene, 1)[0])
+        reference = bent_kick(own, random)
+        if reference is None:
+            continue
+        tried = tried_episodes(Kick.of(own, reference), 1, each, seed + len(found))
+        episodes, lost = contact_episodes(scene, tried, CONTACTS * len(tried.states), seed + len(found))
+        found.append(episodes)
+        dropped += lost
+    return join(found), dropped
+
+
+def bent_kick(scene: Scene, random: np.random.Generator) -> Reference | None:
+    """The embedded kick, bent, slower or faster, by a scene's human; None where it drives no ball away."""
+    human = scene.bodies[0]
+    bent = styles.kicks(random, bodies.human(), np.zeros(1, int), LENGTH, scene.dt)
+    targets = np.clip(in_detail(human, bent), *styles.limits(human))[0]
+    try:
+        reference = references.struck(scene, references.starts(scene, [key_poses.load()])[0], targets)
+    except ValueError:
+        return None
+    after = min(reference.strike + references.MEETING, len(reference.states) - 1)
+    speed = np.linalg.norm(reference.states[after, -1, packed.VELOCITY])
+    return reference if STRIKES[0] <= reference.strike <= STRIKES[1] and speed > SPEED else None
