@@ -31,6 +31,7 @@ from tasks.keypoints import formats, lift, physical
 from tasks.keypoints.picture import pose_picture
 from tasks.keypoints.points import Keypoints
 from tasks.models import ROWS, DynamicsName
+from tasks.motions import angles, bvh
 from tasks.scenarios import ANY_HUMAN
 
 # Of each plan.
@@ -141,7 +142,7 @@ def main(
         person: which of several, in order of appearance from 0; the one who is seen best by default.
         dynamics: the planner's model: larp (learned) or mujoco.
         seed: of the planner's random numbers.
-        out: folder for summary.json, pose.npz (a reference for tasks.kick) and pose.png.
+        out: folder for summary.json, pose.npz and pose.bvh (each a reference for tasks.kick), and pose.png.
         quiet: print nothing.
         json: print the summary as JSON, and on stderr what else is told.
     """
@@ -195,12 +196,13 @@ def main(
     told.add_row("fell", "yes" if made.fell else "no")
     told.add_row("planning", f"{summary['plan_seconds']:.1f} s, {summary['candidates']} candidates")
     tell.result(told, summary)
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **angles_of(made.wanted.states if made.fell else made.states, made.body, DT))
+    buffer, given = io.BytesIO(), angles_of(made.wanted.states if made.fell else made.states, made.body, DT)
+    np.savez_compressed(buffer, **given)
     write_whole(out / "pose.npz", buffer.getvalue())
+    write_whole(out / "pose.bvh", bvh.dumps(angles.load(out / "pose.npz")).encode())
     pose_picture(film, lifted.camera, made.found, made.start, out / "pose.png")
     write_whole(out / "summary.json", (text.dumps(summary, indent=2) + "\n").encode())
-    tell(f"{out}/: summary.json, pose.npz, pose.png")
+    tell(f"{out}/: summary.json, pose.npz, pose.bvh, pose.png")
 
 
 def cli() -> None:

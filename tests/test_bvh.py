@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from larp_model.bodies import human
 from larp_model.scene import Scene
 from tasks.benchmarks import reference as benchmark
-from tasks.motions import bvh, skeleton
+from tasks.motions import angles, bvh, skeleton
 from tasks.motions.references import captured
 
 CLIPS = Path(__file__).parents[2] / "shared" / "mocap"
@@ -161,6 +161,22 @@ def test_refused_in_one_line(load: Callable[[str], skeleton.Motion], content: st
     with pytest.raises(ValueError, match=expected) as refusal:
         load(content)
     assert str(refusal.value).startswith("clip.bvh ") and "\n" not in str(refusal.value)
+
+
+def test_what_is_written_is_read_again(tmp_path: Path) -> None:
+    random, body = np.random.default_rng(0), human()
+    turns = 0.6 * random.standard_normal((20, len(body.motors), 3))
+    root = Rotation.from_rotvec(0.4 * random.standard_normal((20, 3))).as_quat(scalar_first=True)
+    motion = angles.motion(60.0, random.standard_normal((20, 3)), root, turns)
+    path = tmp_path / "written.bvh"
+    path.write_text(bvh.dumps(motion))
+    again = bvh.load(path)
+    assert again.rate == pytest.approx(60.0, abs=1e-4)
+    rows = [again.names.index(name) for name in motion.names]  # a file goes down limb by limb
+    np.testing.assert_allclose(again.offsets[rows], motion.offsets, atol=1e-6)
+    np.testing.assert_allclose(again.positions[:, rows], motion.positions, atol=1e-5)
+    for name in motion.names:
+        assert (again.rotation(name) * motion.rotation(name).inv()).magnitude().max() < 1e-5
 
 
 def test_missing_file_is_refused(tmp_path: Path) -> None:

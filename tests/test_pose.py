@@ -16,7 +16,7 @@ from tasks.command import run
 from tasks.keypoints import filmed, lift, metrics, physical
 from tasks.keypoints.figure import SHARED
 from tasks.keypoints.points import POINTS, Keypoints
-from tasks.motions import angles
+from tasks.motions import angles, bvh
 from tasks.motions.references import embedded
 
 
@@ -51,6 +51,8 @@ def test_a_film_becomes_a_motion_in_mujoco_and_a_reference(film: dict[str, Any],
     assert (out / "pose.png").read_bytes().startswith(b"\x89PNG")
     motion = angles.load(out / "pose.npz")
     assert motion.rate == pytest.approx(100.0)
+    written_too = bvh.load(out / "pose.bvh")
+    np.testing.assert_allclose(written_too.path("LeftToeBase"), motion.path("LeftToeBase"), atol=1e-4)
     hips, true = motion.path("Hips"), metrics.pelvis(film["true"])[:, 0]
     moved = np.linalg.norm(hips[-1] - hips[0]), np.linalg.norm(true[-1] - true[0])
     assert moved[0] == pytest.approx(moved[1], abs=0.2)

@@ -44,7 +44,8 @@ SKELETONS = {
 UNITS = (0.0254 / 0.45, 0.01, 1.0)
 LEG_LENGTH = (0.6, 1.2)
 _OURS = {"X": "Y", "Y": "Z", "Z": "X"}  # a file's axes in our words; positions are reordered accordingly
-_TO_OURS = [2, 0, 1]
+_TO_OURS, _TO_FILE = [2, 0, 1], [1, 2, 0]
+_TURNS = ("Zrotation", "Xrotation", "Yrotation")
 _LARGEST = 1e6
 _PREFIX = re.compile(r"^(.*:|mixamorig\d*_)")  # of a whole skeleton, as in mixamorig:Hips
 
@@ -65,6 +66,42 @@ def load(path: str | Path, names: Mapping[str, str] | None = None) -> Motion:
         return _motion(_named(joints, tables), duration, data)
     except ValueError as error:
         raise ValueError(f"{path.name} {error}") from None
+
+
+def dumps(motion: Motion) -> str:
+    """A motion as the text of a BVH file in centimetres, by its own joint names; `load` gives it back.
+
+    Every joint turns about z, x and y, in a file's axes; the root moves, too. Bones that carry no joint end 5 cm on.
+    """
+    children = [np.flatnonzero(motion.parents == row) for row in range(len(motion.names))]
+    order: list[int] = []
+    lines = ["HIERARCHY"]
+
+    def place(offset: np.ndarray) -> str:
+        return "OFFSET " + " ".join(f"{100.0 * value + 0.0:.6f}" for value in offset[_TO_FILE])
+
+    def add(row: int, depth: int) -> None:
+        order.append(row)
+        margin, root = "  " * depth, motion.parents[row] < 0
+        moved = "6 Xposition Yposition Zposition" if root else "3"
+        lines.extend((f"{margin}{'ROOT' if root else 'JOINT'} {motion.names[row]}", margin + "{"))
+        lines.extend((f"{margin}  {place(motion.offsets[row])}", f"{margin}  CHANNELS {moved} {' '.join(_TURNS)}"))
+        for child in children[row]:
+            add(child, depth + 1)
+        if not len(children[row]):
+            end = motion.offsets[row] / max(float(np.linalg.norm(motion.offsets[row])), 1e-9)
+            lines.extend((f"{margin}  End Site", margin + "  {", f"{margin}    {place(0.05 * end)}", margin + "  }"))
+        lines.append(margin + "}")
+
+    add(0, 0)
+    columns = [100.0 * motion.positions[:, 0, _TO_FILE]]
+    for row in order:
+        turned, parent = motion.rotation(motion.names[row]), motion.parents[row]
+        local = motion.rotation(motion.names[parent]).inv() * turned if parent >= 0 else turned
+        columns.append(local.as_euler("".join(_OURS[turn[0]] for turn in _TURNS), degrees=True))
+    lines += ["MOTION", f"Frames: {len(motion.positions)}", f"Frame Time: {1.0 / motion.rate:.8f}"]
+    lines += [" ".join(f"{value + 0.0:.6f}" for value in frame) for frame in np.concatenate(columns, axis=1)]
+    return "\n".join(lines) + "\n"
 
 
 def names_in(path: Path) -> dict[str, str]:
