@@ -7,7 +7,6 @@ its last checkpoint. So the same command takes up a run that was cut off.
 from __future__ import annotations
 
 import json
-import math
 import os
 import platform
 import time
@@ -39,14 +38,11 @@ from tasks.data import contact_episodes, random_task
 from tasks.kick import Kick
 from tasks.models import WEIGHTS, Models, learned_models
 from tasks.presets import Preset
-from tasks.scenarios import ANY_HUMAN, Scenario, scenario, trained_at
-from tasks.tried import tried_by_many
+from tasks.scenarios import Scenario, scenario, trained_at
 
 EVALUATION_SEED = 1
 # Short episodes of impacts for each long one.
 CONTACTS = 3
-# Of each kick's plan, so many of what it tried in the truth.
-TRIES = 96
 # How the planner searches for the candidates that it is trained on: by sampling, for a step by gradients tries few.
 CANDIDATES = Preset((CEM(256, 10, 24, 1.0),), (CEM(128, 3, 24, 1.0),), every=4)
 # Errors of a velocity count linearly: the median launch matters, not the worst.
@@ -60,7 +56,7 @@ class Stage(NamedTuple):
     """
 
     name: str
-    adds: Literal["", "planned", "contacts", "tried"]
+    adds: Literal["", "planned", "contacts"]
     recipe: training.Recipe
     uses: tuple[str, ...] = ("",)
 
@@ -88,8 +84,6 @@ GENERAL = (Stage("steps", "", OVER_MECHANICS),)
 # A struck ball is its launch, and nothing blurs that; what else is struck is a body like others, whose response counts
 # like the push.
 STRIKING_BALLS = (*GENERAL, Stage("impacts", "", IMPACTS))
-# What planners do with a ball, they do where random motion seldom comes.
-TRIED = (Stage("tried", "tried", replace(IMPACTS, updates=8000, learning_rate=5e-4)),)
 STRIKING = (*GENERAL, Stage("impacts", "", replace(IMPACTS, only=("contact", "response"), loss=LOSS)))
 # One leg on the other, the body's own motion left as it is.
 LEGS = (
@@ -123,18 +117,15 @@ def stages_of(chosen: Scenario) -> tuple[Stage, ...]:
     return (
         *(STRIKING_BALLS if balls else STRIKING),
         *(LEGS if scene.within.pairs else ()),
-        *(TRIED if chosen.name in ANY_HUMAN.values() else ()),
     )
 
 
-def planned_episodes(
-    kick: Kick, models: Models, tasks: int, elites: int, seed: int, seconds: float = math.inf
-) -> tuple[Episodes, int]:
+def planned_episodes(kick: Kick, models: Models, tasks: int, elites: int, seed: int) -> tuple[Episodes, int]:
     """What the planner tries: of each of its plans on the way to `tasks` kicks some elites, executed in the truth.
 
-    seconds: after which no other kick is begun. Returns the episodes, of the plans' horizon, and how many diverged.
+    Returns the episodes, of the plans' horizon, and how many diverged.
     """
-    random, begin = np.random.default_rng(seed), time.perf_counter()
+    random = np.random.default_rng(seed)
     planners = kick.planners_of(CANDIDATES, models)
     states, controls = [], []
     for index in range(tasks):
@@ -146,8 +137,6 @@ def planned_episodes(
             for knots in np.asarray(replan.plan.elites[:count]):
                 states.append(execution.states[replan.step])
                 controls.append(planners.first.controls(replan.plan._replace(elites=knots[None]), window))
-        if time.perf_counter() - begin > seconds:
-            break
     return truth_episodes.record(Truth(kick.scene, 128), np.stack(states), np.stack(controls))
 
 
@@ -241,9 +230,7 @@ def main(
         if stage.name in done:
             continue
         later = seed + 1000 * number
-        if stage.adds == "tried":
-            add(stage.name, partial(tried_by_many, chosen.scene, tasks, TRIES, later))
-        elif stage.adds and kick is not None and learned is not None:
+        if stage.adds and kick is not None and learned is not None:
             models = learned_models(chosen.scene, model, learned, stage.name)
             last = [*sources.values()][-1]
             makers = {

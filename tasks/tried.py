@@ -10,28 +10,17 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from larp_model import bodies
-from larp_model import state as packed
-from larp_model.scene import Scene
-from larp_model.truth.episodes import Episodes, join
+from larp_model.truth.episodes import Episodes
 from larp_model.truth.mujoco import SUBSTEPS
 from mpc import Continued, GaussNewton, MujocoDynamics
 from mpc.dynamics import BatchedTruth
-from tasks.data import contact_episodes, random_task
-from tasks.kick import Kick
+from tasks.data import random_task
 from tasks.models import models_of
-from tasks.motions import key_poses, references, styles
-from tasks.motions.details import in_detail
-from tasks.motions.people import random_people
-from tasks.motions.references import Reference
 from tasks.task import Task
 
-# It steps as the presets do; after so many rounds most kicks hit.
-STEPS = GaussNewton(rounds=8, directions=24)
-# A bent kick is worth planning where it strikes in one of these steps, and drives the ball as fast as this [m/s].
-STRIKES, SPEED = (15, 60), 3.0
-# Steps of a bent kick; disturbed contacts that are drawn of each try.
-LENGTH, CONTACTS = 120, 2
+# It steps as the presets do, rounds enough for most kicks to hit, from so many steps before the reference's strike on:
+# sooner would cost twice as much, and lead to strikes that are hardly others.
+STEPS, BEFORE = GaussNewton(rounds=6, directions=24), 30
 
 
 class Watched:
@@ -54,7 +43,7 @@ class Watched:
 
 
 def tried_episodes(task: Task, kicks: int, each: int, seed: int, seconds: float = math.inf) -> Episodes:
-    """Of the first plans of so many random kicks, `each` of what they tried, as long as a plan.
+    """Of plans of so many random kicks, made shortly before the reference strikes, `each` of what they tried.
 
     seconds: after which no other kick is begun.
     """
@@ -63,12 +52,13 @@ def tried_episodes(task: Task, kicks: int, each: int, seed: int, seconds: float 
     assert isinstance(whole, Continued) and isinstance(whole.dynamics, MujocoDynamics)
     watched = Watched(whole.dynamics.truth)
     planner = task.planner(replace(whole, dynamics=MujocoDynamics(watched)), (STEPS,))
-    parts = []
+    parts, begin = [], max(task.reference.strike - BEFORE, 0)
     for index in range(kicks):
         target, shift = random_task(random)
-        state, wanted = task.start(), task.window(target)(0)
+        state, wanted = task.reference.states[begin].copy(), task.window(target)(begin)
         state[task.ball, :2] += shift
-        planner.step(planner.init(jax.random.key(seed + index)), state, wanted.controls, wanted.context)
+        plan = planner.init(jax.random.key(seed + index))
+        planner.step(plan, state, wanted.controls, wanted.context, steps=wanted.steps)
         states, controls, after = (np.concatenate(rows) for rows in zip(*watched.seen, strict=True))
         watched.seen.clear()
         rows = random.choice(len(states), min(each, len(states)), replace=False)
@@ -81,34 +71,3 @@ def tried_episodes(task: Task, kicks: int, each: int, seed: int, seconds: float 
     sizes = np.broadcast_to(task.scene.morphology.astype(np.float32), (count, links, 3))
     return Episodes(states, controls, np.zeros((*controls.shape[:2], links, 3), np.float32), sizes)
 
-
-def tried_by_many(scene: Scene, kicks: int, each: int, seed: int) -> tuple[Episodes, int]:
-    """Contacts of what is tried on the way to kicks of many humans of every size, each near a bent kick of its own.
-
-    Returns short episodes, some `CONTACTS` of each try (see `data.contact_episodes`), and how many were dropped.
-    """
-    random, found, dropped = np.random.default_rng(seed), list[Episodes](), 0
-    while len(found) < kicks:
-        own = scene.sized(random_people(random, scene, 1)[0])
-        reference = bent_kick(own, random)
-        if reference is None:
-            continue
-        tried = tried_episodes(Kick.of(own, reference), 1, each, seed + len(found))
-        episodes, lost = contact_episodes(scene, tried, CONTACTS * len(tried.states), seed + len(found))
-        found.append(episodes)
-        dropped += lost
-    return join(found), dropped
-
-
-def bent_kick(scene: Scene, random: np.random.Generator) -> Reference | None:
-    """The embedded kick, bent, slower or faster, by a scene's human; None where it drives no ball away."""
-    human = scene.bodies[0]
-    bent = styles.kicks(random, bodies.human(), np.zeros(1, int), LENGTH, scene.dt)
-    targets = np.clip(in_detail(human, bent), *styles.limits(human))[0]
-    try:
-        reference = references.struck(scene, references.starts(scene, [key_poses.load()])[0], targets)
-    except ValueError:
-        return None
-    after = min(reference.strike + references.MEETING, len(reference.states) - 1)
-    speed = np.linalg.norm(reference.states[after, -1, packed.VELOCITY])
-    return reference if STRIKES[0] <= reference.strike <= STRIKES[1] and speed > SPEED else None

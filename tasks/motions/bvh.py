@@ -87,7 +87,7 @@ def dumps(motion: Motion) -> str:
         lines.extend((f"{margin}{'ROOT' if root else 'JOINT'} {motion.names[row]}", margin + "{"))
         lines.extend((f"{margin}  {place(motion.offsets[row])}", f"{margin}  CHANNELS {moved} {' '.join(_TURNS)}"))
         for child in children[row]:
-            add(child, depth + 1)
+            add(int(child), depth + 1)
         if not len(children[row]):
             end = motion.offsets[row] / max(float(np.linalg.norm(motion.offsets[row])), 1e-9)
             lines.extend((f"{margin}  End Site", margin + "  {", f"{margin}    {place(0.05 * end)}", margin + "  }"))

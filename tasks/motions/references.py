@@ -117,27 +117,6 @@ def embedded(scene: Scene, steps: int = 300, poses: KeyPoses | None = None) -> R
     return Reference(states, controls, int(moving.argmax()) - 1)
 
 
-def struck(scene: Scene, state: np.ndarray, controls: np.ndarray) -> Reference:
-    """A kick by joint targets (T, J, 3) [rad] from a state (L, 13), its ball waiting where the right foot is fastest.
-
-    ValueError where the truth diverges, or no ball is hit.
-    """
-    away, truth = state.copy(), Truth(scene)
-    away[-1, packed.POSITION] = (-50.0, 0.0, scene.links[-1].radius)
-    alone, _ = truth.rollout(away[None], controls[None])
-    swing = np.linalg.norm(alone[0, :, scene.index(scene.bodies[0].name, "right_foot"), packed.VELOCITY], axis=-1)
-    swing[: 2 * MEETING] = 0.0  # what swings at once hits a ball that the human stands in
-    spot, _ = _spot("these joint targets", scene, alone[0], int(np.nanargmax(swing)))
-    away[-1, packed.POSITION] = spot
-    after, fine = truth.rollout(away[None], controls[None])
-    states = np.concatenate([away[None], after[0]])
-    moving = np.linalg.norm(states[:, -1, packed.VELOCITY], axis=-1) > 0.5
-    if not (fine[0] and moving.any()):
-        raise ValueError("these joint targets kick no ball in the truth")
-    strike = int(moving.argmax()) - 1
-    return Reference(_launched_along_x(states, strike), controls, strike)
-
-
 def motion_of(path: Path, names: Mapping[str, str] | None = None) -> Motion:
     """The motion of a BVH file or of an npz file; see `captured`."""
     if path.suffix.lower() != ".npz":
