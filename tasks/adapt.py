@@ -45,7 +45,7 @@ TRUTH, STRIKES, PLANS, SWING = 0.08, 0.1, 0.2, 0.4
 # impacts are learned from: from a few thousand, each disturbed, weights learn those few.
 STRIKE, IMPACT = 14, 6
 # Of each plan so many of what it tried, and more kicks than are planned in any time.
-TRIED, KICKS = 64, 1000
+TRIED, KICKS = 128, 1000
 # The check at the end [s], and the least that is worth beginning [min].
 CHECKING, LEAST = 20.0, 2.0
 # Learning rate of a swing that has been learned already, and more updates than fit into any time.

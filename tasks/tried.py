@@ -18,9 +18,8 @@ from tasks.data import random_task
 from tasks.models import models_of
 from tasks.task import Task
 
-# It steps as the presets do, rounds enough for most kicks to hit, from so many steps before the reference's strike on:
-# sooner would cost twice as much, and lead to strikes that are hardly others.
-STEPS, BEFORE = GaussNewton(rounds=6, directions=24), 30
+# It steps as the presets do, rounds enough for most kicks to hit.
+STEPS = GaussNewton(rounds=8, directions=24)
 
 
 class Watched:
@@ -43,7 +42,7 @@ class Watched:
 
 
 def tried_episodes(task: Task, kicks: int, each: int, seed: int, seconds: float = math.inf) -> Episodes:
-    """Of plans of so many random kicks, made shortly before the reference strikes, `each` of what they tried.
+    """Of the first plans of so many random kicks, `each` of what they tried, as long as a plan.
 
     seconds: after which no other kick is begun.
     """
@@ -52,13 +51,12 @@ def tried_episodes(task: Task, kicks: int, each: int, seed: int, seconds: float 
     assert isinstance(whole, Continued) and isinstance(whole.dynamics, MujocoDynamics)
     watched = Watched(whole.dynamics.truth)
     planner = task.planner(replace(whole, dynamics=MujocoDynamics(watched)), (STEPS,))
-    parts, begin = [], max(task.reference.strike - BEFORE, 0)
+    parts = []
     for index in range(kicks):
         target, shift = random_task(random)
-        state, wanted = task.reference.states[begin].copy(), task.window(target)(begin)
+        state, wanted = task.start(), task.window(target)(0)
         state[task.ball, :2] += shift
-        plan = planner.init(jax.random.key(seed + index))
-        planner.step(plan, state, wanted.controls, wanted.context, steps=wanted.steps)
+        planner.step(planner.init(jax.random.key(seed + index)), state, wanted.controls, wanted.context)
         states, controls, after = (np.concatenate(rows) for rows in zip(*watched.seen, strict=True))
         watched.seen.clear()
         rows = random.choice(len(states), min(each, len(states)), replace=False)

@@ -1,4 +1,4 @@
-"""What the planner tries in the truth is what happens there, starts before the strike and leads to the targets."""
+"""What the planner tries in the truth is what happens there, starts where the kick does and leads to the targets."""
 
 import numpy as np
 import pytest
@@ -17,12 +17,11 @@ def task() -> Kick:
 def test_what_is_tried_is_what_happens_in_the_truth(task: Kick, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tried, "STEPS", tried.GaussNewton(rounds=1, directions=6))
     episodes = tried_episodes(task, kicks=2, each=5, seed=3)
-    begin = task.reference.strike - tried.BEFORE
-    assert episodes.states.shape == (10, task.horizon - begin + 1, len(task.scene.links), 13)
+    assert episodes.states.shape == (10, task.horizon + 1, len(task.scene.links), 13)
     after, finite = Truth(task.scene, 10, SUBSTEPS).rollout(episodes.states[:, 0], episodes.controls)
     assert finite.all()
     np.testing.assert_allclose(after, episodes.states[:, 1:], atol=1e-3)
-    first = task.reference.states[begin, task.human]
+    first = task.start()[task.human]
     np.testing.assert_allclose(episodes.states[:, 0, task.human], first[None].repeat(10, 0), atol=1e-6)
 
 
