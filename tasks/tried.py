@@ -15,8 +15,8 @@ from larp_model.truth.mujoco import SUBSTEPS
 from mpc import Continued, GaussNewton, MujocoDynamics
 from mpc.dynamics import BatchedTruth
 from tasks.data import random_task
+from tasks.kick import Kick
 from tasks.models import models_of
-from tasks.task import Task
 
 # It steps as the presets do, rounds enough for most kicks to hit.
 STEPS = GaussNewton(rounds=8, directions=24)
@@ -41,22 +41,21 @@ class Watched:
         return after, finite
 
 
-def tried_episodes(task: Task, kicks: int, each: int, seed: int, seconds: float = math.inf) -> Episodes:
+def tried_episodes(kick: Kick, kicks: int, each: int, seed: int, seconds: float = math.inf) -> Episodes:
     """Of the first plans of so many random kicks, `each` of what they tried, as long as a plan.
 
     seconds: after which no other kick is begun.
     """
     random, began = np.random.default_rng(seed), time.perf_counter()
-    whole = models_of(task.scene, "mujoco", Path(), SUBSTEPS).whole
+    whole = models_of(kick.scene, "mujoco", Path(), SUBSTEPS).whole
     assert isinstance(whole, Continued) and isinstance(whole.dynamics, MujocoDynamics)
     watched = Watched(whole.dynamics.truth)
-    planner = task.planner(replace(whole, dynamics=MujocoDynamics(watched)), (STEPS,))
+    planner = kick.planner(replace(whole, dynamics=MujocoDynamics(watched)), (STEPS,))
     parts = []
     for index in range(kicks):
         target, shift = random_task(random)
-        state, wanted = task.start(), task.window(target)(0)
-        state[task.ball, :2] += shift
-        planner.step(planner.init(jax.random.key(seed + index)), state, wanted.controls, wanted.context)
+        plan, wanted = planner.init(jax.random.key(seed + index)), kick.window(target)(0)
+        planner.step(plan, kick.start(shift), wanted.controls, wanted.context)
         states, controls, after = (np.concatenate(rows) for rows in zip(*watched.seen, strict=True))
         watched.seen.clear()
         rows = random.choice(len(states), min(each, len(states)), replace=False)
@@ -65,7 +64,6 @@ def tried_episodes(task: Task, kicks: int, each: int, seed: int, seconds: float 
         if time.perf_counter() - began > seconds:
             break
     states, controls = (np.concatenate(rows) for rows in zip(*parts, strict=True))
-    count, links = len(states), len(task.scene.links)
-    sizes = np.broadcast_to(task.scene.morphology.astype(np.float32), (count, links, 3))
+    count, links = len(states), len(kick.scene.links)
+    sizes = np.broadcast_to(kick.scene.morphology.astype(np.float32), (count, links, 3))
     return Episodes(states, controls, np.zeros((*controls.shape[:2], links, 3), np.float32), sizes)
-
