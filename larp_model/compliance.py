@@ -7,7 +7,7 @@ free link yields at x to an impulse at y,
     W(x) = G_xx - G_xj (G_jj + W_p)^-1 G_jx
 
 Joints carry no moment here. What does stiffen them during an impact, the motor's armature and damping, is counted as
-inertia of the outer link.
+inertia of the outer link. `mechanics.fading` does without that, at a higher price.
 """
 
 from __future__ import annotations
@@ -40,6 +40,17 @@ def stiffening(joint: Joint, held: float, strength: Array) -> Array | float:
     """
     motor = joint.motor
     return held * joint.damping if motor is None else strength * (motor.armature + held * motor.damping)
+
+
+def resisting(joint: Joint, after: Array | float, strength: Array) -> Array:
+    """Moment that a joint has taken up a while (*,) [s] after its links began to part, per spin [kg m^2]: (*,).
+
+    It is the joint's inertia, damping and stiffness, as an implicit step of that length sees them.
+    """
+    motor = joint.motor
+    if motor is None:
+        return after * joint.damping * jnp.ones_like(strength)
+    return strength * (motor.armature + after * motor.damping + after**2 * motor.stiffness)
 
 
 def compliance(

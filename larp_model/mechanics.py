@@ -26,7 +26,7 @@ from jax import Array
 
 from larp_model import rotation
 from larp_model import state as packed
-from larp_model.compliance import HELD, moments, stiffening
+from larp_model.compliance import HELD, moments, resisting, stiffening
 from larp_model.kinematics import anchors, strength
 from larp_model.scene import Body, Vector
 
@@ -158,19 +158,27 @@ def free_motion(
 
 
 def impulse_response(
-    body: Body, state: Array, push: Array, morphology: Array, constants: Constants = Constants()
-) -> tuple[Array, Array]:
+    body: Body, state: Array, push: Array, morphology: Array, constants: Constants = Constants(),
+    acting: Array | None = None,
+) -> tuple[Array, Array]:  # fmt: skip
     """Velocities and spins (B, n, 3) that the links of a body in states (B, n, 13) gain from impulses.
 
     push (B, n, 6): impulse [N s] and moment [N m s] about each link's centre; morphology (B or 1, n, 3). Joints pass on
-    impulses, and moments as far as servos stiffen them at once; the ground is not asked.
+    impulses, and moments as far as servos stiffen them at once, or within the time (B,) [s] for which the impulses have
+    been acting; the ground is not asked.
     """
     state, push, sizes = (jnp.moveaxis(each, 0, -1) for each in (state, push, morphology))
     matrices = turns(state[:, packed.ORIENTATION])
     tied = turned_anchors(body, local_anchors(body, sizes), matrices)
     still = jnp.zeros_like(push[1:, :3])
     stronger = strength(body, morphology)
-    stiff = [jnp.broadcast_to(stiffening(each, constants.held, stronger), push.shape[-1:]) for each in body.joints]
+    stiff = [
+        jnp.broadcast_to(
+            stiffening(each, constants.held, stronger) if acting is None else resisting(each, acting, stronger),
+            push.shape[-1:],
+        )
+        for each in body.joints
+    ]
     hold = jnp.reshape(jnp.array(stiff), (-1, 1, 1, push.shape[-1])) * jnp.eye(3, dtype=push.dtype)[..., None]
     levels = [
         Level(rows, parents, *(each[rows - 1] for each in (*tied, still, still, hold))) for rows, parents in tree(body)
@@ -178,6 +186,125 @@ def impulse_response(
     gained = solve(inertias(body, matrices, sizes), Push(push[:, 3:], push[:, :3]), levels)
     velocity, spin = (jnp.moveaxis(each, -1, 0) for each in gained)
     return velocity, spin
+
+
+def fading(
+    body: Body, rows: np.ndarray, matrices: Array, morphology: Array, times: tuple[float, ...]
+) -> tuple[Array, ...]:
+    """What P links of a body have gained, t after a unit impulse: w(t) = W_0 + sum of W_i exp(-t / T_i).
+
+    W_i: (B, P, 6, 6) each, velocity and spin by impulse and moment about the links' centres; W_0 is the first of them.
+    times: T_i [s]. What is gained fades as servos and dampers pull the links back, and of that w `responses` know
+
+        integral of w(t) exp(-t / T) dt / T = W(T)
+
+    which is made right at once and at all T_i. The rest is as in `responses`.
+    """
+    after = (0.0, *times)
+    known = responses(body, rows, matrices, morphology, after)
+    faded = np.array([[1.0, *(time / (time + passed) for time in times)] for passed in after])
+    return tuple(jnp.tensordot(jnp.asarray(line, known.dtype), known, 1) for line in np.linalg.inv(faded))
+
+
+def responses(body: Body, rows: np.ndarray, matrices: Array, morphology: Array, after: tuple[float, ...]) -> Array:
+    """W(T) = C (M + T D + T^2 K)^-1 C' (times, B, P, 6, 6) of P links of a body, for all times T [s] in `after`.
+
+    Velocity and spin that a link gains by an impulse and a moment about its centre, all others tied to it by joints
+    that resist as after that time: see `compliance.resisting`. From the root outwards, with a joint's S, and D that
+    resists its turning,
+
+        W_i = L W_p L' + S D^-1 S',    L = (1 - S D^-1 S' A_i) X_i
+
+    rows: (P,). matrices: (B, n, 3, 3) rotations of all links. morphology (B or 1, n, 3).
+    """
+    count = len(matrices)
+    morphology = jnp.broadcast_to(morphology, (count, *morphology.shape[1:]))
+    matrices, sizes = (jnp.tile(jnp.moveaxis(each, 0, -1), len(after)) for each in (matrices, morphology))
+    passed, stronger = (
+        jnp.repeat(jnp.asarray(after, matrices.dtype), count),
+        jnp.tile(strength(body, morphology), len(after)),
+    )
+    tied = turned_anchors(body, local_anchors(body, sizes), matrices)
+    unit, still = jnp.eye(3, dtype=matrices.dtype)[..., None], jnp.zeros_like(matrices[:, 0])
+    hold = jnp.stack([resisting(each, passed, stronger) for each in body.joints])[:, None, None] * unit
+    levels = [
+        Level(links, parents, *(each[links - 1] for each in (*tied, still[1:], still[1:], hold)))
+        for links, parents in tree(body)
+    ]
+    whole, _, joined = inwards(inertias(body, matrices, sizes), Push(still, still), levels)
+    gives = {0: _inverse(Inertia(*(block[:1] for block in whole)))}
+    # A scan over levels, filled up to as many links of each, because as many copies take long to compile.
+    needed = _ancestry(body, rows)
+    lines = [line for level in levels if len(line := level.rows[np.isin(level.rows, needed)])]
+    most = max(map(len, lines), default=0)
+    lines = [np.resize(line, most) for line in lines]
+    given, last = [], np.zeros(most, int)
+    for line, level, joint in zip(lines, levels, joined, strict=False):
+        at = np.searchsorted(level.rows, line)
+        above = np.array([np.flatnonzero(last == parent)[0] for parent in level.parents[at]])
+        arrays = level.child, level.child - level.parent, joint.to_turn, joint.to_move, joint.factor
+        given.append((above, *(each[at] for each in arrays)))
+        last = line
+    if given:
+        start = Inertia(*(jnp.repeat(block, most, axis=0) for block in gives[0]))
+        _, found = jax.lax.scan(_outwards, start, jax.tree.map(lambda *each: jnp.stack(each), *given))
+        for number, line in enumerate(lines):
+            gives |= {row: Inertia(*(each[number, i : i + 1] for each in found)) for i, row in enumerate(line)}
+    chosen = Inertia(*(jnp.concatenate(each) for each in zip(*(gives[row] for row in rows), strict=True)))
+    mixed = jnp.swapaxes(chosen.mixed, 1, 2)
+    blocks = ((chosen.moving, mixed), (chosen.mixed, chosen.turning))
+    matrix = jnp.concatenate([jnp.concatenate(row, axis=2) for row in blocks], axis=1)
+    return jnp.moveaxis(matrix.reshape(len(rows), 6, 6, len(after), count), (3, 4), (0, 1))
+
+
+def _ancestry(body: Body, rows: np.ndarray) -> list[int]:
+    """Links and all that are on their way to the root."""
+    found: list[int] = []
+    for row in map(int, rows):
+        while row and row not in found:
+            found.append(row)
+            row = body.joints[row - 1].parent
+    return found
+
+
+def _inverse(inertia: Inertia) -> Inertia:
+    """From momenta to spin and velocity."""
+    still = invert(inertia.moving)
+    lever = mm(inertia.mixed, still)
+    turning = invert(inertia.turning - mm(lever, jnp.swapaxes(inertia.mixed, 1, 2)))
+    mixed = -mm(turning, lever)
+    return Inertia(turning, mixed, still - mm(jnp.swapaxes(lever, 1, 2), mixed))
+
+
+def _outwards(parents: Inertia, given: tuple[Array, Array, Array, Array, Array, Array]) -> tuple[Inertia, Inertia]:
+    """How the links of a level give way, twice over, from how those of the one before do; see `responses`.
+
+    given: which of those are their parents, `Level.child`, the way from `Level.parent` to it, and of `Joined` all but
+    the first.
+    """
+    above, child, arm, to_turn, to_move, factor = given
+    parent = Inertia(*(block[above] for block in parents))
+    unit = jnp.broadcast_to(jnp.eye(3, dtype=child.dtype)[..., None], to_turn.shape)
+    by_turn = -to_turn - cross_rows(to_move, arm)
+    # L, to spin and to velocity, from the parent's spin and velocity
+    to_spin = unit + by_turn, -to_move
+    to_velocity = cross_columns(arm, unit) + cross_columns(child, by_turn), unit - cross_columns(child, to_move)
+    mixed = jnp.swapaxes(parent.mixed, 1, 2)
+    half = [
+        (mm(one, parent.turning) + mm(two, mixed), mm(one, parent.mixed) + mm(two, parent.moving))
+        for one, two in (to_spin, to_velocity)
+    ]
+
+    def whole(first: tuple[Array, Array], second: tuple[Array, Array]) -> Array:
+        return mm(first[0], jnp.swapaxes(second[0], 1, 2)) + mm(first[1], jnp.swapaxes(second[1], 1, 2))
+
+    turns = upper(factor, lower(factor, unit))
+    aside = -cross_rows(turns, child)
+    own = Inertia(
+        whole(half[0], to_spin) + turns, whole(half[0], to_velocity) + aside,
+        whole(half[1], to_velocity) + cross_columns(child, aside),
+    )  # fmt: skip
+    return own, own
 
 
 def tree(body: Body) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -340,8 +467,21 @@ def decided(value: Array, width: float) -> Array:
     return jax.lax.stop_gradient(jnp.clip(value / width, 0.0, 1.0))
 
 
-def solve(inertia: Inertia, push: Push, levels: list[Level]) -> tuple[Array, Array]:
-    """Velocities and spins (n, 3, B) with which links part under their pushes and their joints' impulses."""
+class Joined(NamedTuple):
+    """Of a level's joints: what turns them, (n, 3, B), by their pushes, and (n, 3, 3, B) by their parents' motion.
+
+    turned: alone [rad/s]. to_turn, to_move: less per spin and per velocity of the parent, seen from the link. factor:
+    the lower triangle L of what resists the joint's turning, L L'.
+    """
+
+    turned: Array
+    to_turn: Array
+    to_move: Array
+    factor: Array
+
+
+def inwards(inertia: Inertia, push: Push, levels: list[Level]) -> tuple[Inertia, Push, list[Joined]]:
+    """Inertia and push of the root with all that hangs on it, and the joints of the levels."""
     passed = []
     for level in reversed(levels):
         own = Inertia(*(block[level.rows] for block in inertia))
@@ -359,7 +499,7 @@ def solve(inertia: Inertia, push: Push, levels: list[Level]) -> tuple[Array, Arr
         to_turn, to_move = upper(factor, half_turn), upper(factor, half_move)
         turned = upper(factor, half)[:, :, 0]
         turned, to_turn, to_move = held((turned, to_turn, to_move))
-        passed.append((turned, to_turn, to_move))
+        passed.append(Joined(turned, to_turn, to_move, factor))
         # What the joint hands on: A - A S (S' A S + G)^-1 S' A, seen from the parent's centre
         turning, mixed, moving = (
             own.turning - mm(jnp.swapaxes(half_turn, 1, 2), half_turn),
@@ -377,9 +517,15 @@ def solve(inertia: Inertia, push: Push, levels: list[Level]) -> tuple[Array, Arr
         handed = Push(handed.turning - cross(arm, handed.moving), handed.moving)
         push = Push(*(_added(a, b, level.parents) for a, b in zip(push, handed, strict=True)))
         inertia, push = held((inertia, push))
+    return inertia, push, passed[::-1]
+
+
+def solve(inertia: Inertia, push: Push, levels: list[Level]) -> tuple[Array, Array]:
+    """Velocities and spins (n, 3, B) with which links part under their pushes and their joints' impulses."""
+    inertia, push, passed = inwards(inertia, push, levels)
     spin, velocity = _root(Inertia(*(block[:1] for block in inertia)), Push(*(each[:1] for each in push)))
     rows = np.array([0])
-    for level, (turned, to_turn, to_move) in zip(levels, reversed(passed), strict=True):
+    for level, (turned, to_turn, to_move, _) in zip(levels, passed, strict=True):
         above = np.array([int(np.flatnonzero(rows == parent)[0]) for parent in level.parents])
         turning, moving = spin[above], velocity[above]
         arm = level.child - level.parent

@@ -50,14 +50,16 @@ class Velocities(NamedTuple):
 class Party(NamedTuple):
     """One body of a pair and those of its links that can touch, one for each pair of links (P,).
 
-    free: the velocities at the end of the step if nothing touches. chosen: one-hot rows (B, K, P) of those pairs that
-    are looked at; all by default.
+    free: the velocities at the end of the step if nothing touches. gives: how the links give way, (B, P, 6, 6) each, as
+    far as a contact's base wants to know it once for all. chosen: one-hot rows (B, K, P) of those pairs that are looked
+    at; all by default.
     """
 
     body: Body
     rows: np.ndarray
     seen: Kinematics
     free: Velocities
+    gives: tuple[Array, ...] = ()
     chosen: Array | None = None
 
     def of(self, values: Array) -> Array:

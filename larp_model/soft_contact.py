@@ -7,7 +7,8 @@ model")
 
 p the gap along the normal n, v the relative velocity, d the impedance. From where the links meet to the end of the step
 this is integrated by the implicit midpoint rule; in every substep the forces are found by projected Gauss-Seidel
-sweeps, contact by contact, from those of the substep before.
+sweeps, contact by contact, from those of the substep before. What forces have made of a link that others are tied to
+fades, and is carried along.
 """
 
 from __future__ import annotations
@@ -26,11 +27,16 @@ from larp_model.vector import Vector
 
 @dataclass(frozen=True)
 class Rule:
-    """How finely it is integrated."""
+    """How finely it is integrated.
+
+    fades: times [s] with which links that are tied to others are pulled back, as in `mechanics.fading`; they are held
+    at once where there are none.
+    """
 
     substeps: int = 10
-    sweeps: int = 4
+    sweeps: int = 8
     impedance: float = contact.IMPEDANCE
+    fades: tuple[float, ...] = ()
 
 
 class Symmetric(NamedTuple):
@@ -76,9 +82,20 @@ class Loose(NamedTuple):
 
 
 class Tied(NamedTuple):
-    """What a link gives way that others are tied to: (*, 6, 6), see `compliance.yields`."""
+    """What a link gives way that others are tied to: (*, 6, 6), see `compliance.yields`.
+
+    passing: what it gives way at first besides, (*, 6, 6) for each of the rule's fades.
+    """
 
     matrix: Array
+    passing: tuple[Array, ...] = ()
+
+    def within(self, time: Array, rule: Rule) -> Tied:
+        """What it gives way on average while a force lasts, (*,) [s]."""
+        given = self.matrix
+        for fade, part in zip(rule.fades, self.passing, strict=True):
+            given = given + (fade / time * (1.0 - jnp.exp(-time / fade)))[..., None, None] * part
+        return Tied(given)
 
     def twist(self, force: Vector, moment: Vector) -> tuple[Vector, Vector]:
         """What a force and a moment do to velocity and spin."""
@@ -142,13 +159,40 @@ class Done(NamedTuple):
     travel: Vector
 
 
+Twist = tuple[Vector, Vector]
+"""A velocity and a spin."""
+
+
+def _fading(side: Side, kept: tuple[Twist, ...], h: Array, rule: Rule) -> Side:
+    """The side as it loses within `h` what passes of that which it keeps from earlier forces."""
+    acceleration, turning = side.acceleration, side.turning
+    for fade, (velocity, spin) in zip(rule.fades, kept, strict=False):
+        rate = (jnp.exp(-h / fade) - 1.0) / h
+        acceleration, turning = acceleration + velocity * rate, turning + spin * rate
+    return side._replace(acceleration=acceleration, turning=turning)
+
+
+def _keeps(
+    passing: tuple[Array, ...], kept: tuple[Twist, ...], force: Vector, moment: Vector, h: Array, rule: Rule
+) -> tuple[Twist, ...]:
+    """What a side keeps after a force and a moment have acted on it for `h`."""
+    after = []
+    for fade, part, (velocity, spin) in zip(rule.fades, passing, kept, strict=False):
+        left = jnp.exp(-h / fade)
+        v, w = Tied(part).twist(force, moment)
+        gained = fade * (1.0 - left)
+        after.append((velocity * left + v * gained, spin * left + w * gained))
+    return tuple(after)
+
+
 # Between the links, and of the ground on those that lie on it.
 _Forces = tuple[Vector, dict[int, Vector]]
-_Carried = tuple[tuple[Moves, Moves], tuple[Done, Done], Vector, _Forces]
+_Kept = tuple[tuple[Twist, ...], tuple[Twist, ...]]
+_Carried = tuple[tuple[Moves, Moves], tuple[Done, Done], Vector, _Forces, _Kept]
 
 
 def press(
-    sides: tuple[Side, Side], surface: Surface, grounds: tuple[Surface | None, Surface | None], time: Array,
+    both: tuple[Side, Side], surface: Surface, grounds: tuple[Surface | None, Surface | None], time: Array,
     apart: Array, rule: Rule = Rule(),
 ) -> tuple[Done, Done, Vector]:  # fmt: skip
     """What contacts do to both links within `time` (*,) [s], and the first's impulse on the second.
@@ -156,12 +200,18 @@ def press(
     grounds: the surfaces with which the links, balls, lie on the ground; None where it is not looked at. apart: (*,)
     where true the links pass through each other, and only the ground is felt.
     """
-    h, one, zero = time / rule.substeps, jnp.ones_like(time), jnp.zeros_like(time)
+    # What is left of the step may be nothing.
+    h, one, zero = jnp.maximum(time / rule.substeps, 1e-7), jnp.ones_like(time), jnp.zeros_like(time)
     nothing, up = Vector(zero, zero, zero), Vector(zero, zero, one)
     lying = {index: ground for index, ground in enumerate(grounds) if ground}
+    passing = tuple(() if isinstance(side.gives, Loose) else side.gives.passing for side in both)
+    fresh = [
+        side if isinstance(side.gives, Loose) else side._replace(gives=side.gives.within(h, rule)) for side in both
+    ]
 
     def substep(carry: _Carried, number: Array) -> tuple[_Carried, None]:
-        moves, done, between, forces = carry
+        moves, done, between, forces, kept = carry
+        sides = [_fading(side, before, h, rule) for side, before in zip(fresh, kept, strict=True)]
         normal, gap, point, _ = contact.nearest(
             *(contact.Axis(own.centre, own.half, side.radius) for own, side in zip(moves, sides, strict=True))
         )
@@ -197,23 +247,27 @@ def press(
         # A scan, because unrolled sweeps take minutes to compile with their derivatives.
         (push, floor), _ = jax.lax.scan(sweep, (push, floor), length=rule.sweeps)
         left = time - (number + 0.5) * h
-        after, felt = [], []
+        after, felt, keep = [], [], []
         for index, (side, own, so_far) in enumerate(zip(sides, moves, done, strict=True)):
             force = push * (1.0 if index else -1.0)
             moment = arms[index].cross(force)
             if index in lying:
                 force, moment = force + floor[index], moment + below[index][0].cross(floor[index])
             v, w = side.gives.twist(force, moment)
+            keep.append(_keeps(passing[index], kept[index], force, moment, h, rule))
             after.append(own.after(side.acceleration + v, side.turning + w, h))
             felt.append(
                 Done(so_far.impulse + force * h, so_far.moment + moment * h, so_far.travel + force * (h * left))
             )
-        return ((after[0], after[1]), (felt[0], felt[1]), between + push * h, (push, floor)), None
+        return (
+            (after[0], after[1]), (felt[0], felt[1]), between + push * h, (push, floor), (keep[0], keep[1])
+        ), None  # fmt: skip
 
-    first, second = (Moves(side.centre, side.half, side.velocity, side.spin) for side in sides)
+    first, second = (Moves(side.centre, side.half, side.velocity, side.spin) for side in both)
     idle = Done(nothing, nothing, nothing)
-    start = ((first, second), (idle, idle), nothing, (nothing, {index: nothing for index in lying}))
-    (_, done, between, _), _ = jax.lax.scan(substep, start, jnp.arange(rule.substeps, dtype=time.dtype))
+    none, other = (((nothing, nothing),) * len(parts) for parts in passing)
+    start = ((first, second), (idle, idle), nothing, (nothing, {index: nothing for index in lying}), (none, other))
+    (_, done, between, _, _), _ = jax.lax.scan(substep, start, jnp.arange(rule.substeps, dtype=time.dtype))
     return done[0], done[1], between
 
 

@@ -6,6 +6,7 @@ import gc
 from collections.abc import Iterator
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import settings
@@ -15,6 +16,7 @@ from larp_model.bodies import human_and_ball
 from larp_model.networks import Weights
 from larp_model.parts.part import Model
 from larp_model.scene import Scene
+from larp_model.simulator import Simulator
 from larp_model.training import Recipe, Windows, statistics_of
 from larp_model.truth.episodes import Episodes
 from tasks.command import remember_compilations
@@ -96,3 +98,12 @@ def compact_weights(compact: Model, episodes: Episodes) -> Weights:
 def paper_weights(paper: Model, episodes: Episodes) -> Weights:
     """Random weights of `paper`."""
     return random_weights(paper, episodes)
+
+
+@pytest.fixture(scope="session")
+def mechanical(scene: Scene, episodes: Episodes) -> Simulator:
+    """The kick's scene by mechanics alone: the hybrid design, of which nothing is learned."""
+    model = designs.hybrid(scene, designs.LEAST)
+    weights = random_weights(model, episodes)
+    outputs = {name: each._replace(mean=jnp.zeros_like(each.mean)) for name, each in weights.outputs.items()}
+    return Simulator(model, weights._replace(networks=jax.tree.map(jnp.zeros_like, weights.networks), outputs=outputs))

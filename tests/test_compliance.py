@@ -14,6 +14,7 @@ from larp_model import state as packed
 from larp_model.bodies import chain, human_and_ball
 from larp_model.compliance import compliance, invert, moments
 from larp_model.kinematics import morphology_of
+from larp_model.mechanics import fading
 from larp_model.meeting import rows_of
 from larp_model.scene import Body, Scene
 from larp_model.truth.mujoco import Truth, compile_model
@@ -69,6 +70,63 @@ def test_compliance_is_symmetric_positive_and_less_than_a_free_links(scene: Scen
         along, _ = moments(*shape[0, row])
         arm = np.sum(np.asarray(points[:, index]) ** 2, axis=-1)
         assert (values[:, index, -1] < 1.0 / scene.links[row].mass + arm / float(along)).all()
+
+
+LEGS, FADES = np.array([5, 6, 7, 10, 11, 12]), (0.002, 0.01)
+
+
+def given_by_the_engine(state: np.ndarray, after: int, row: int, substep: float) -> np.ndarray:
+    """(3, 3) velocity that a link's centre has gained so many engine steps after a unit impulse there, each way."""
+    scene = human_and_ball()
+    model, truth = compile_model(scene, round(scene.dt / substep)), Truth(scene)
+    model.opt.gravity[:] = 0.0
+    truth.reset(state)
+    position, _ = truth.coordinates()
+    body = model.body(f"human/{scene.links[row].name}").id
+    columns = []
+    for impulse in np.concatenate([np.zeros((1, 3)), 0.01 * np.eye(3)]):
+        data, jacobian, gained = mujoco.MjData(model), np.zeros((3, model.nv)), np.zeros((1, model.nv))
+        data.qpos[:] = position[0]
+        mujoco.mj_forward(model, data)
+        mujoco.mj_jacBody(model, data, jacobian, None, body)
+        mujoco.mj_solveM(model, data, gained, impulse[None] @ jacobian)
+        data.qvel[:] = gained[0]
+        for _ in range(after):
+            mujoco.mj_step(model, data)
+        mujoco.mj_forward(model, data)
+        mujoco.mj_jacBody(model, data, jacobian, None, body)
+        columns.append(jacobian @ data.qvel)
+    return (np.array(columns[1:]) - columns[0]).T / 0.01
+
+
+def faded(state: np.ndarray, after: float) -> np.ndarray:
+    """(6, 3, 3) what `fading` says of thighs, shins and feet."""
+    human = human_and_ball().bodies[0]
+    links = slice(0, len(human.links))
+    matrices = rotation.matrix(packed.orientation(jnp.asarray(state[:, links])))
+    shape = morphology_of(human_and_ball())[None, links]
+    lasts, *passes = fading(human, LEGS, matrices, shape, FADES)
+    whole = lasts + sum(part * np.exp(-after / fade) for part, fade in zip(passes, FADES, strict=True))
+    return np.asarray(whole)[0, :, :3, :3]
+
+
+def test_legs_give_way_at_once_as_the_engines_inertia_says_motors_included(reference: Reference) -> None:
+    for step in (10, 30, 40):
+        state = reference.states[step : step + 1]
+        for index, row in enumerate(LEGS):
+            expected = given_by_the_engine(state, 0, int(row), 1e-4)
+            np.testing.assert_allclose(faded(state, 0.0)[index], expected, rtol=2e-3, atol=2e-3)
+
+
+def test_what_legs_have_gained_fades_as_their_servos_pull_them_back(reference: Reference) -> None:
+    state = reference.states[30:31].copy()
+    state[:, :13, 2] += 1.0  # away from the ground
+    for index, row in enumerate(LEGS):
+        at_once = np.linalg.norm(faded(state, 0.0)[index])
+        for milliseconds in (1, 2, 5, 10):
+            expected = given_by_the_engine(state, 10 * milliseconds, int(row), 1e-4)
+            error = np.linalg.norm(faded(state, 1e-3 * milliseconds)[index] - expected) / at_once
+            assert error < 0.1
 
 
 def test_capsules_have_the_engines_moments_of_inertia() -> None:

@@ -106,7 +106,7 @@ def test_a_batch_equals_single_runs(simulator: Simulator, meetings: np.ndarray) 
 def test_what_the_base_is_survives_on_disk(simulator: Simulator, tmp_path: Path) -> None:
     manifest = stored.save(tmp_path, "tiny", MODEL, simulator.weights, {})
     part = stored.load(manifest, SCENE)[0].bodies[0]
-    assert isinstance(part, Articulated) and part.base == OverMechanics()
+    assert isinstance(part, Articulated) and part.base == OverMechanics(lasting=True)
 
 
 def test_a_push_changes_a_capsule_by_its_mass_from_when_it_acts() -> None:

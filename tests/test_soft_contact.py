@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax import Array
 
-from larp_model import contact, meeting
+from larp_model import contact, evaluation, meeting
 from larp_model import state as packed
 from larp_model.bodies import BALL_SURFACE, two_balls
 from larp_model.designs import hybrid
@@ -15,9 +15,13 @@ from larp_model.meeting import Velocities
 from larp_model.parts.contact import Contact, Known
 from larp_model.parts.impacts import FreeImpact, SoftContacts
 from larp_model.scene import Scene
+from larp_model.simulator import Simulator
 from larp_model.soft_contact import Done, Loose, Rule, Side, press
+from larp_model.truth.episodes import Episodes
 from larp_model.truth.mujoco import Truth
 from larp_model.vector import Vector
+from tasks.data import random_episodes
+from tasks.motions.references import Reference
 
 GROUND, USUAL = two_balls().bodies[0].surface, Rule()
 
@@ -155,6 +159,33 @@ def test_a_struck_ball_moves_as_in_the_truth(height: float, most: float) -> None
         impulse = np.asarray(known(scene, base, states).impulses[1])[:, 0]
         errors[name] = np.linalg.norm(impulse / 0.43 - gained, axis=-1) / np.linalg.norm(gained, axis=-1)
     assert np.median(errors["soft"]) < most and np.median(errors["soft"]) < 0.5 * np.median(errors["free"])
+
+
+def test_a_kicked_ball_leaves_nearly_as_in_the_truth_though_nothing_is_learned(
+    scene: Scene, reference: Reference, mechanical: Simulator
+) -> None:
+    episodes, _ = random_episodes(scene, reference, count=256, seed=5, steps=48)
+    found = evaluation.launch(mechanical, episodes, 0)
+    assert found["count"] > 50
+    assert found["relative_error"]["median"] < 0.05
+
+
+def test_a_ball_that_slides_loses_its_slip_to_the_ground_as_in_the_truth_though_nothing_is_learned(
+    scene: Scene, episodes: Episodes, mechanical: Simulator
+) -> None:
+    count, random = 64, np.random.default_rng(6)
+    states = np.repeat(episodes.states[:1, 0].astype(np.float64), count, axis=0)
+    ball = states[:, -1]
+    ball[:, packed.POSITION] = 9.0, 0.0, 0.11
+    ball[:, packed.VELOCITY] = random.uniform([-6.0, -6.0, -4.0], [6.0, 6.0, 0.0], (count, 3))
+    ball[:, packed.ANGULAR_VELOCITY] = 20.0 * random.standard_normal((count, 3))
+    resting = episodes.controls[:1, :1].repeat(count, axis=0)
+    truth = Truth(scene, count).rollout(states, resting.astype(np.float64))[0][:, 0, -1]
+    predicted = np.asarray(mechanical.rollout(jnp.asarray(states, jnp.float32), jnp.asarray(resting)))[:, 0, -1]
+    for part, most in ((packed.VELOCITY, 0.04), (packed.ANGULAR_VELOCITY, 0.06)):
+        gained, error = truth[:, part] - ball[:, part], predicted[:, part] - truth[:, part]
+        relative = np.linalg.norm(error[:, :2], axis=-1) / np.linalg.norm(gained[:, :2], axis=-1)
+        assert np.median(relative) < most
 
 
 def test_the_oddest_starts_leave_values_and_gradients_finite() -> None:

@@ -45,10 +45,12 @@ class OverMechanics:
     """The network corrects what mechanics says, in the frame of the course of the root's axis.
 
     It sees how the links are to the ground with the velocities that they will have. Capsules are seen by their axes
-    alone: how one has rolled about its own changes nothing. constants: see `mechanics.Constants`.
+    alone: how one has rolled about its own changes nothing. constants: see `mechanics.Constants`. lasting: joints
+    resist impulses for as long as those have acted on average, instead of at once.
     """
 
     constants: mechanics.Constants = field(default_factory=mechanics.Constants)
+    lasting: bool = False
 
     def begin(self, body: Body, seen: Kinematics, control: Array, torque: Array, gravity: float, dt: float) -> Known:
         """See `Base`."""
@@ -71,10 +73,11 @@ class OverMechanics:
     def answer(self, body: Body, seen: Kinematics, hits: Hits, dt: float) -> Array:
         """See `Base`. All impulses together act on positions for as long as they do on average."""
         push = hits.push
-        gained = jnp.stack(mechanics.impulse_response(body, seen.state, push, seen.morphology, self.constants), axis=1)
         impulse, travel = (contact.norm(each).sum(axis=-1) for each in (push[..., :3], hits.travel))
-        acting = (travel / jnp.maximum(impulse, 1e-6))[:, None, None, None]
-        return jnp.concatenate([gained, (acting - 0.5 * dt) * gained], axis=1)
+        acting = travel / jnp.maximum(impulse, 1e-6)
+        given = body, seen.state, push, seen.morphology, self.constants, acting if self.lasting else None
+        gained = jnp.stack(mechanics.impulse_response(*given), axis=1)
+        return jnp.concatenate([gained, (acting - 0.5 * dt)[:, None, None, None] * gained], axis=1)
 
 
 def paper_inputs(body: Body, seen: Kinematics, control: Array, torque: Array) -> tuple[list[Array], list[Array]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple, Protocol
 
 import jax
@@ -40,6 +41,9 @@ class Known(NamedTuple):
 
 class Base(Protocol):
     """What is known of a contact before anything learned is asked."""
+
+    def prepared(self, party: Party) -> Party:
+        """A party with what is worked out once for all its links."""
 
     def known(self, first: Party, second: Party, met: Meeting, part: Contact) -> Known:
         """What the links of two bodies do to each other."""
@@ -110,22 +114,23 @@ class Contact:
         number = jnp.where(within, jnp.cumsum(within, axis=1), 0)
         none = Hits.none(seen[0]), Hits.none(seen[1])
 
-        def touch(found: tuple[Hits, Hits], turn: Array) -> tuple[tuple[Hits, Hits], None]:
+        def touch(both: tuple[Party, Party], found: tuple[Hits, Hits], turn: Array) -> tuple[tuple[Hits, Hits], None]:
             mine = number == turn
 
             def one_more() -> tuple[Hits, Hits]:
-                both = self.touch(weights, *(party._replace(chosen=mine[:, None]) for party in (first, second)))
+                more = self.touch(weights, *(party._replace(chosen=mine[:, None]) for party in both))
                 there = jnp.any(mine, axis=1)[:, None, None]
                 one, two = (
-                    hits.plus(jax.tree.map(lambda each: jnp.where(there, each, 0.0), more))
-                    for hits, more in zip(found, both, strict=True)
+                    hits.plus(jax.tree.map(lambda each: jnp.where(there, each, 0.0), new))
+                    for hits, new in zip(found, more, strict=True)
                 )
                 return one, two
 
             return jax.lax.cond(jnp.any(mine), one_more, lambda: found), None
 
         def all_of_them() -> tuple[Hits, Hits]:
-            return jax.lax.scan(touch, none, 1 + jnp.arange(number.shape[1]))[0]
+            both = self.base.prepared(first), self.base.prepared(second)
+            return jax.lax.scan(partial(touch, both), none, 1 + jnp.arange(number.shape[1]))[0]
 
         # Steps without contact are by far the most.
         one, two = jax.lax.cond(jnp.any(within), all_of_them, lambda: none)
@@ -146,7 +151,7 @@ class Contact:
 
     def measure(self, seen: tuple[Kinematics, Kinematics], free: tuple[Velocities, Velocities]) -> Measured:
         """See `PairPart`."""
-        first, second = meeting.parties(self.pair, self.bodies, seen, free)
+        first, second = map(self.base.prepared, meeting.parties(self.pair, self.bodies, seen, free))
         met = meeting.meet(self.pair, first, second, self.dt, self.constants)
         known = self.base.known(first, second, met, self)
         views = [self.inputs(first, second, met, known)]

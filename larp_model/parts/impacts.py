@@ -6,9 +6,12 @@ from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from larp_model import contact, soft_contact
 from larp_model.compliance import moments, yields
+from larp_model.kinematics import picked
+from larp_model.mechanics import fading
 from larp_model.meeting import Meeting, Party
 from larp_model.parts.contact import UP, Contact, Known
 from larp_model.soft_contact import Loose, Rule, Side, Tied
@@ -23,6 +26,10 @@ class FreeImpact:
     """
 
     impedance: float = contact.IMPEDANCE
+
+    def prepared(self, party: Party) -> Party:
+        """See `Base`: nothing is."""
+        return party
 
     def known(self, first: Party, second: Party, met: Meeting, part: Contact) -> Known:
         """See `Base`."""
@@ -50,9 +57,17 @@ class SoftContacts:
 
     rule: Rule = field(default_factory=Rule)
 
+    def prepared(self, party: Party) -> Party:
+        """See `Base`."""
+        if party.body.is_ball or not self.rule.fades:
+            return party
+        seen, (links, places) = party.seen, np.unique(party.rows, return_inverse=True)
+        gives = fading(party.body, links, seen.matrices, seen.morphology, self.rule.fades)
+        return party._replace(gives=tuple(each[:, places] for each in gives))
+
     def known(self, first: Party, second: Party, met: Meeting, part: Contact) -> Known:
         """See `Base`."""
-        one, two = (_side(party, met, number, part) for number, party in enumerate((first, second)))
+        one, two = (_side(party, met, number, part, self.rule) for number, party in enumerate((first, second)))
         ground1, ground2 = (party.body.surface if party.body.is_ball else None for party in (first, second))
         time, apart = met.remaining, jnp.zeros(met.remaining.shape, bool)
         if grounded := bool(ground1 or ground2):
@@ -81,7 +96,7 @@ def _flipped(known: Known) -> Known:
     return known._replace(impulses=known.impulses[::-1], moments=known.moments[::-1], travel=known.travel[::-1])
 
 
-def _side(party: Party, met: Meeting, number: int, part: Contact) -> Side:
+def _side(party: Party, met: Meeting, number: int, part: Contact, rule: Rule) -> Side:
     """A link at the moment at which it meets the other."""
     segment, seen = met.segments[number], party.seen
     share = 1.0 - (met.remaining / part.dt)[..., None]
@@ -93,8 +108,12 @@ def _side(party: Party, met: Meeting, number: int, part: Contact) -> Side:
         acceleration = acceleration - part.gravity * jnp.asarray(UP, velocity.dtype)
         gives = Loose(1.0 / mass, 1.0 / moments(length, radius, mass)[0])
     else:
-        held = part.constants.held
-        gives = Tied(yields(party.body, party.rows, seen.matrices, seen.morphology, held, party.chosen))
+        if rule.fades:
+            lasts, *passes = (picked(each, party.chosen) for each in party.gives)
+            gives = Tied(lasts, tuple(passes))
+        else:
+            held = part.constants.held
+            gives = Tied(yields(party.body, party.rows, seen.matrices, seen.morphology, held, party.chosen))
     return Side(
         Vector.of(segment.centre), Vector.of(segment.half), segment.radius, Vector.of(velocity), Vector.of(spin),
         Vector.of(acceleration), Vector.of(turning), gives,

@@ -26,18 +26,21 @@ class Ground(NamedTuple):
     """A ball and the ground within one step: scalars (B, F) for its network and what they are made of.
 
     slip (B, 3): of the ball's lowest point [m/s]. near (B,): 1 where the ball touches the ground within the step.
+    touching (B,): for how long at most [s].
     """
 
     inputs: Array
     bounce: contact.Impact
     near: Array
     slip: Array
+    touching: Array
 
 
 @dataclass(frozen=True)
 class Sphere:
     """Away from every contact it is exact free flight.
 
+    sliding: what friction does on the ground is known, see `held`; else the network has to say it.
     bounds: what the network may add, so that no state, however odd, is thrown out of the world: share of the free
     bounce, speed [m/s], stick, drag, grip, roll, twist, lag [ms]. margin: above which the ground is not felt [m].
     """
@@ -49,6 +52,7 @@ class Sphere:
     bounds: tuple[float, ...] = (1.0, 1.0, 0.5, 0.5, 0.5, 0.5, 0.5, 3.0)
     margin: float = 0.01
     impedance: float = contact.IMPEDANCE
+    sliding: bool = False
 
     invariant = True
 
@@ -79,6 +83,9 @@ class Sphere:
         kick = impulse[:, :3] / mass
         bounce = ground.bounce.change[:, None] * (1.0 + scale) + add
         lag = ground.bounce.lag[:, None] + 0.001 * late
+        if self.sliding:
+            held = self.held(ground, bounce)
+            stick, grip = stick + held, grip + held
         slide = -stick * ground.slip - drag * along
         new_velocity = velocity - self.gravity * dt * up + kick + bounce * up + slide
         moment = (impulse[:, 3:] + dt * torque) / (SPHERE * mass * radius**2)
@@ -94,6 +101,18 @@ class Sphere:
         )
         turned = rotation.integrate(packed.orientation(ball), 0.5 * dt * (spin + new_spin))
         return packed.pack(packed.position(ball) + moved, turned, new_velocity, new_spin)[:, None]
+
+    def held(self, ground: Ground, bounce: Array) -> Array:
+        """Share (B, 1) of its slip that friction takes from the ball's velocity, pressed by a bounce (B, 1) [m/s].
+
+        Without a limit its slip dies away at the surface's damping, in MuJoCo's law as in `soft_contact`; Coulomb's is
+        the limit. Of what the lowest point loses a part goes into the spin.
+        """
+        surface, gives = self.body.surface, 1.0 + 1.0 / SPHERE
+        slip = contact.norm(ground.slip)[:, None]
+        dies = 1.0 - jnp.exp(-surface.damping * ground.touching[:, None])
+        most = gives * surface.friction * jnp.maximum(bounce, 0.0) / jnp.maximum(slip, 1e-6)
+        return jnp.minimum(dies, most) / gives
 
     def measure(self, seen: Kinematics, after: Array, control: Array, torque: Array) -> tuple[Measured, Velocities]:
         """See `BodyPart`."""
@@ -131,4 +150,4 @@ class Sphere:
             ],
             axis=-1,
         )
-        return Ground(inputs, bounce, contact.smooth_gate(lowest, self.margin), slip)
+        return Ground(inputs, bounce, contact.smooth_gate(lowest, self.margin), slip, dt - start)
