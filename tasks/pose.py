@@ -58,7 +58,7 @@ def cut(keypoints: Keypoints) -> Keypoints:
 
 
 def angles_of(states: np.ndarray, body: Body, dt: float) -> dict[str, Any]:
-    """States (T, L, 13) as `motions.angles.load` reads them: those of our human of 1.75 m, as it would move."""
+    """States (T, L, 13) as arguments of `motions.angles.motion`: those of our human of 1.75 m, as it would move."""
     smaller = standing_height(human()) / standing_height(body)
     turned = [
         Rotation.from_quat(states[:, row, packed.ORIENTATION], scalar_first=True) for row in range(len(body.links))
@@ -69,7 +69,7 @@ def angles_of(states: np.ndarray, body: Body, dt: float) -> dict[str, Any]:
         "position": smaller * states[:, 0, packed.POSITION],
         "orientation": states[:, 0, packed.ORIENTATION],
         "angles": np.stack(angles, axis=1),
-        "joints": np.array([body.links[child].name for child, _, _ in body.motors]),
+        "joints": [body.links[child].name for child, _, _ in body.motors],
     }
 
 
@@ -186,7 +186,7 @@ def main(
         "seed": seed,
     }
     if made.fell:
-        tell("the human fell: pose.npz holds the kinematic start instead, which no physics has seen")
+        tell("the human fell: pose.npz and pose.bvh hold the kinematic start instead, which no physics has seen")
     told = Table("", "", title="Motion from keypoints", show_header=False)
     told.add_row("frames", f"{len(film)}, {len(film) / film.rate:.1f} s")
     told.add_row("height of the person", f"{summary['height_m']:.2f} m")
@@ -199,7 +199,7 @@ def main(
     buffer, given = io.BytesIO(), angles_of(made.wanted.states if made.fell else made.states, made.body, DT)
     np.savez_compressed(buffer, **given)
     write_whole(out / "pose.npz", buffer.getvalue())
-    write_whole(out / "pose.bvh", bvh.dumps(angles.load(out / "pose.npz")).encode())
+    write_whole(out / "pose.bvh", bvh.dumps(angles.motion(**given)).encode())
     pose_picture(film, lifted.camera, made.found, made.start, out / "pose.png")
     write_whole(out / "summary.json", (text.dumps(summary, indent=2) + "\n").encode())
     tell(f"{out}/: summary.json, pose.npz, pose.bvh, pose.png")

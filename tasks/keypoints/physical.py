@@ -33,7 +33,7 @@ from tasks.keypoints.camera import Camera
 from tasks.keypoints.figure import Figure, Pose
 from tasks.keypoints.lift import FEET, OUTLIER, PIXELS, SLOW, Lifted
 from tasks.keypoints.points import POINTS, Keypoints
-from tasks.motions.references import clearance
+from tasks.motions.references import clearance, leading
 from tasks.presets import usable
 
 HORIZON, KNOTS, EVERY = 50, 11, 5
@@ -59,10 +59,7 @@ class Wanted(NamedTuple):
 
 
 def wanted_of(scene: Scene, figure: Figure, lifted: Lifted, keypoints: Keypoints) -> Wanted:
-    """The kinematic start and the keypoints at every step of the scene's time.
-
-    The joint targets are ahead of the angles by what the servos lag behind: damping / stiffness.
-    """
+    """The kinematic start and the keypoints at every step of the scene's time."""
     human = scene.bodies[0]
     begin = np.arange(len(keypoints)) / keypoints.rate
     times = np.arange(int(begin[-1] / scene.dt + 1e-6) + 1) * scene.dt
@@ -82,8 +79,6 @@ def wanted_of(scene: Scene, figure: Figure, lifted: Lifted, keypoints: Keypoints
     states[:, 0, packed.POSITION] = place
     states[:, 0, packed.VELOCITY] = np.gradient(place, scene.dt, axis=0)
     states = closed(scene, states)
-    lag = np.array([motor.damping / motor.stiffness for motor in scene.motors])[:, None]
-    targets = angles + lag * np.gradient(angles, scene.dt, axis=0)
 
     seen = np.nan_to_num(keypoints.places)
     found = lifted.camera.project(figure.all_points(lifted.pose, lifted.proportions))
@@ -95,7 +90,7 @@ def wanted_of(scene: Scene, figure: Figure, lifted: Lifted, keypoints: Keypoints
     points = figure.all_points(Pose(place, root.as_matrix(), angles), lifted.proportions)[:, FEET]
     speed = np.linalg.norm(np.gradient(points, scene.dt, axis=0), axis=-1)
     stands = np.exp(-((np.maximum(points[..., 2] - 0.03, 0.0) / 0.05) ** 2)) / (1.0 + (speed / SLOW) ** 2) ** 2
-    return Wanted(states, targets, places, trusted[nearest], stands)
+    return Wanted(states, leading(scene, angles), places, trusted[nearest], stands)
 
 
 class Seen:

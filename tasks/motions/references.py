@@ -178,10 +178,7 @@ def _launched_along_x(states: np.ndarray, strike: int) -> np.ndarray:
 
 
 def _wanted(scene: Scene, clip: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """The clip as states (T, L, 13) and joint targets (T, J, 3) [rad] of the human, its ball out of the way.
-
-    The targets are ahead of the joint angles by what the servos lag behind: damping / stiffness.
-    """
+    """The clip as states (T, L, 13) and joint targets (T, J, 3) [rad] of the human, its ball out of the way."""
     human, ball = scene.bodies[0], scene.bodies[-1]
     orientations, lean = skeleton.retarget(clip, bodies.human(), scene.dt)
     poses = in_detail(human, lean)
@@ -198,8 +195,13 @@ def _wanted(scene: Scene, clip: Motion) -> tuple[np.ndarray, np.ndarray]:
         turned = Rotation.from_quat(states[:, row, packed.ORIENTATION], scalar_first=True)
         states[:-1, row, packed.ANGULAR_VELOCITY] = (turned[1:] * turned[:-1].inv()).as_rotvec() / scene.dt
     states[:, -1, packed.POSITION] = (-50.0, 0.0, ball.links[0].radius)
+    return states, leading(scene, poses)
+
+
+def leading(scene: Scene, poses: np.ndarray) -> np.ndarray:
+    """Joint targets (T, J, 3) [rad] whose servos hold these angles: ahead by their lag, damping / stiffness."""
     lag = np.array([motor.damping / motor.stiffness for motor in scene.motors])[:, None]
-    return states, poses + lag * np.gradient(poses, scene.dt, axis=0)
+    return poses + lag * np.gradient(poses, scene.dt, axis=0)
 
 
 def _importance(scene: Scene, steps: int, strike: int) -> np.ndarray:
