@@ -52,12 +52,14 @@ FADES = (0.002, 0.01)
 
 def compact(scene: Scene, sizes: Sizes = COMPACT) -> Model:
     """The model that the kick is planned with."""
-    return _impulsive(scene, sizes, FromNothing(), FreeImpact())
+    return _impulsive(scene, sizes, FromNothing(), FreeImpact(), FreeImpact())
 
 
 def hybrid(scene: Scene, sizes: Sizes = SIZES["small"]) -> Model:
     """The model over mechanics."""
-    return _impulsive(scene, sizes, OverMechanics(lasting=True), SoftContacts(Rule(fades=FADES)), sliding=True)
+    # A body's own links press on each other for long, and there mechanics of itself says what joints resist.
+    known, within = SoftContacts(Rule(fades=FADES)), SoftContacts()
+    return _impulsive(scene, sizes, OverMechanics(lasting=True), known, within, sliding=True)
 
 
 def paper(scene: Scene, sizes: Sizes = PAPER) -> Model:
@@ -73,8 +75,10 @@ DesignName = Literal["compact", "hybrid", "paper"]
 DESIGNS: dict[DesignName, Callable[[Scene], Model]] = {"compact": compact, "hybrid": hybrid, "paper": paper}
 
 
-def _impulsive(scene: Scene, sizes: Sizes, base: Base, known: ContactBase, sliding: bool = False) -> Model:
-    """Bodies and contacts that are impulses, on these bases."""
+def _impulsive(
+    scene: Scene, sizes: Sizes, base: Base, known: ContactBase, within: ContactBase, sliding: bool = False
+) -> Model:
+    """Bodies and contacts that are impulses, on these bases: of two bodies, and within one."""
 
     def body_part(body: Body) -> BodyPart:
         if body.is_ball:
@@ -83,9 +87,11 @@ def _impulsive(scene: Scene, sizes: Sizes, base: Base, known: ContactBase, slidi
         response = Response(sizes.contact) if touched else None
         return Articulated(body, scene.dt, scene.gravity, base, sizes.body, response)
 
-    return _made(
-        scene, body_part, lambda bodies, pair: Contact(bodies, pair, scene.dt, scene.gravity, known, sizes.contact)
-    )
+    def pair_part(bodies: tuple[Body, Body], pair: Pair) -> PairPart:
+        base = within if pair.first == pair.second else known
+        return Contact(bodies, pair, scene.dt, scene.gravity, base, sizes.contact)
+
+    return _made(scene, body_part, pair_part)
 
 
 def _made(
