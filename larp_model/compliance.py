@@ -33,7 +33,7 @@ def moments(length: Array, radius: Array, mass: Array) -> tuple[Array, Array]:
     return along, across
 
 
-def stiffening(joint: Joint, held: float, strength: Array) -> Array | float:
+def stiffening(joint: Joint, held: Array | float, strength: Array) -> Array | float:
     """Moment that a joint takes up during an impact per spin that its links part with [kg m^2], (*,) or ().
 
     strength: (*,), see `kinematics.strength`.
@@ -47,10 +47,8 @@ def resisting(joint: Joint, after: Array | float, strength: Array) -> Array:
 
     It is the joint's inertia, damping and stiffness, as an implicit step of that length sees them.
     """
-    motor = joint.motor
-    if motor is None:
-        return after * joint.damping * jnp.ones_like(strength)
-    return strength * (motor.armature + after * motor.damping + after**2 * motor.stiffness)
+    spring = 0.0 if joint.motor is None else joint.motor.stiffness
+    return stiffening(joint, after, strength) + strength * after**2 * spring
 
 
 def compliance(

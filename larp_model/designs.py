@@ -57,7 +57,7 @@ def compact(scene: Scene, sizes: Sizes = COMPACT) -> Model:
 
 def hybrid(scene: Scene, sizes: Sizes = SIZES["small"]) -> Model:
     """The model over mechanics."""
-    # A body's own links press on each other for long, and there mechanics of itself says what joints resist.
+    # A body's own links press on each other for longer than an impact: with fading, legs slip further through.
     known, within = SoftContacts(Rule(fades=FADES)), SoftContacts()
     return _impulsive(scene, sizes, OverMechanics(lasting=True), known, within, sliding=True)
 

@@ -67,7 +67,7 @@ class SoftContacts:
 
     def known(self, first: Party, second: Party, met: Meeting, part: Contact) -> Known:
         """See `Base`."""
-        one, two = (_side(party, met, number, part, self.rule) for number, party in enumerate((first, second)))
+        one, two = (_side(party, met, number, part) for number, party in enumerate((first, second)))
         ground1, ground2 = (party.body.surface if party.body.is_ball else None for party in (first, second))
         time, apart = met.remaining, jnp.zeros(met.remaining.shape, bool)
         if grounded := bool(ground1 or ground2):
@@ -96,7 +96,7 @@ def _flipped(known: Known) -> Known:
     return known._replace(impulses=known.impulses[::-1], moments=known.moments[::-1], travel=known.travel[::-1])
 
 
-def _side(party: Party, met: Meeting, number: int, part: Contact, rule: Rule) -> Side:
+def _side(party: Party, met: Meeting, number: int, part: Contact) -> Side:
     """A link at the moment at which it meets the other."""
     segment, seen = met.segments[number], party.seen
     share = 1.0 - (met.remaining / part.dt)[..., None]
@@ -107,13 +107,12 @@ def _side(party: Party, met: Meeting, number: int, part: Contact, rule: Rule) ->
     if party.body.is_ball:
         acceleration = acceleration - part.gravity * jnp.asarray(UP, velocity.dtype)
         gives = Loose(1.0 / mass, 1.0 / moments(length, radius, mass)[0])
+    elif party.gives:
+        lasts, *passes = (picked(each, party.chosen) for each in party.gives)
+        gives = Tied(lasts, tuple(passes))
     else:
-        if rule.fades:
-            lasts, *passes = (picked(each, party.chosen) for each in party.gives)
-            gives = Tied(lasts, tuple(passes))
-        else:
-            held = part.constants.held
-            gives = Tied(yields(party.body, party.rows, seen.matrices, seen.morphology, held, party.chosen))
+        held = part.constants.held
+        gives = Tied(yields(party.body, party.rows, seen.matrices, seen.morphology, held, party.chosen))
     return Side(
         Vector.of(segment.centre), Vector.of(segment.half), segment.radius, Vector.of(velocity), Vector.of(spin),
         Vector.of(acceleration), Vector.of(turning), gives,
