@@ -237,6 +237,13 @@ def test_picture_shows_something(recording: Recording, tmp_path: Path, case: str
     assert all(0.005 < quarter.mean() < 0.5 for quarter in quarters)
 
 
+def test_picture_names_no_cost_that_has_no_curve(recording: Recording, tmp_path: Path) -> None:
+    costs = {"ball": [3.0, 1.0, 0.1]}
+    kick_picture(recording, costs, tmp_path / "shown.png")
+    kick_picture(recording, costs | {"upright": [0.0, 0.0, 0.0], "lost": [np.inf]}, tmp_path / "besides.png")
+    np.testing.assert_array_equal(imread(tmp_path / "shown.png"), imread(tmp_path / "besides.png"))
+
+
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="Chromium is not installed")
 def test_replay_runs_in_a_browser(recording: Recording, tmp_path: Path) -> None:
     write_html(recording, tmp_path / "kick.html")

@@ -27,6 +27,8 @@ PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#3
 LEAST = 1e-6  # a cost below has no place on a logarithmic axis
 ABOUT = """Drag the green target, then **Kick** (key K). The model plans, MuJoCo carries out.
 
+The ball has two handles: where it lies and, above it, how it rolls.
+
 Thin lines are other candidates, dark ones cheap; grey is the reference."""
 
 Asked = Callable[[str, "viser.ClientHandle | None"], None]

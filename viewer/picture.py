@@ -36,7 +36,7 @@ QUIET = "#5b6470"
 
 def kick_picture(recording: Recording, costs: Mapping[str, Sequence[float]] | None, path: str | Path) -> None:
     """Write a PNG of 1800 x 1000 pixels. costs: of each term, its share of the plan's cost at each replan."""
-    terms = {name: values for name, values in (costs or {}).items() if len(values)}
+    terms = {name: shown for name, values in (costs or {}).items() if not np.isnan(shown := _shown(values)).all()}
     figure = Figure((WIDTH, HEIGHT), DOTS, facecolor="white")
     canvas = FigureCanvasAgg(figure)
     miss = nearest_approach(recording.path, recording.target).distance
@@ -183,17 +183,19 @@ def _paths(above: Axes, beside: Axes, recording: Recording) -> None:
     above.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False, fontsize=11)
 
 
-def _costs(axes: Axes, terms: Mapping[str, Sequence[float]]) -> None:
-    """The terms over the replans; what is zero or infinite has no place on the logarithmic axis."""
-    greatest = 0.0
-    for (name, values), colour, marker in zip(terms.items(), cycle(PALETTE), cycle("osD^vP"), strict=False):
-        shown = np.asarray(values, float)
-        shown = np.where((shown > 0.0) & np.isfinite(shown), shown, np.nan)
-        greatest = max(greatest, float(np.nan_to_num(shown).max()))
+def _shown(values: Sequence[float]) -> np.ndarray:
+    """Costs with gaps where they are zero or infinite, which has no place on a logarithmic axis."""
+    given = np.asarray(values, float)
+    return np.where((given > 0.0) & np.isfinite(given), given, np.nan)
+
+
+def _costs(axes: Axes, terms: Mapping[str, np.ndarray]) -> None:
+    """The terms over the replans, as `_shown`."""
+    for (name, shown), colour, marker in zip(terms.items(), cycle(PALETTE), cycle("osD^vP"), strict=False):
         axes.plot(np.arange(1, len(shown) + 1), shown, color=colour, marker=marker, ms=4, lw=1.5, label=name)
-    if greatest > 0.0:
-        axes.set_yscale("log")
-        axes.set_ylim(max(axes.get_ylim()[0], greatest * 10.0**-DECADES), None)
+    greatest = max(float(np.nanmax(shown)) for shown in terms.values())
+    axes.set_yscale("log")
+    axes.set_ylim(max(axes.get_ylim()[0], greatest * 10.0**-DECADES), None)
     axes.set_xlim(0.5, max(map(len, terms.values())) + 0.5)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     axes.set_xlabel("replan")
