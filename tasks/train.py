@@ -26,6 +26,7 @@ from larp_model import weights as stored
 from larp_model.designs import DesignName, SizeName
 from larp_model.losses import LossWeights
 from larp_model.networks import Weights
+from larp_model.parts.part import assemble
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from larp_model.truth import episodes as truth_episodes
@@ -214,7 +215,9 @@ def main(
     sizes = random.morphology
     rounds: list[dict[str, Any]] = []
     if start:
-        _, learned, content = stored.load(start, chosen.scene, partly=True)
+        given, learned, content = stored.load(start, chosen.scene, partly=True)
+        # What they were trained over stays: networks that correct other mechanics would be wrong.
+        model = assemble(chosen.scene, (*model.parts, *given.parts))
         rounds = content["recipe"]["rounds"]
         sizes = np.concatenate([sizes, stored.extremes(content, chosen.scene)])
     done = {each["stage"] for each in rounds}

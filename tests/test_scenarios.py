@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from larp_model import kinematics
+from larp_model import designs, kinematics
 from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.designs import DesignName
@@ -128,6 +128,15 @@ def test_a_scene_becomes_weights_and_scores(
     assert found["launch"] == {}
     assert found["us_per_step"]["2"] > 0.0
     assert (tmp_path / "model.png").stat().st_size > 1000
+
+
+def test_training_that_goes_on_keeps_the_mechanics_that_the_weights_correct(tmp_path: Path) -> None:
+    given, scene = stored.SHIPPED / "chain4.json", SCENARIOS["chain4"].scene
+    before, _, _ = stored.load(given, scene)
+    assert before != designs.hybrid(scene), "or this test could not fail"
+    train.main(scene="chain4", folder=tmp_path, episodes=16, start=given)
+    after, _, _ = stored.load(tmp_path / "weights/chain4.json", scene)
+    assert after == before
 
 
 def test_other_bodies_than_a_human_are_not_asked_for_another_kick(tmp_path: Path) -> None:
