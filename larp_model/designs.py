@@ -52,14 +52,16 @@ FADES = (0.002, 0.01)
 
 def compact(scene: Scene, sizes: Sizes = COMPACT) -> Model:
     """The model that the kick is planned with."""
-    return _impulsive(scene, sizes, FromNothing(), FreeImpact(), FreeImpact())
+    impact = FreeImpact(), sizes.contact
+    return _impulsive(scene, sizes, FromNothing(), impact, impact)
 
 
 def hybrid(scene: Scene, sizes: Sizes = SIZES["small"]) -> Model:
     """The model over mechanics."""
-    # A body's own links press on each other for longer than an impact: with fading, legs slip further through.
-    known, within = SoftContacts(Rule(fades=FADES)), SoftContacts()
-    return _impulsive(scene, sizes, OverMechanics(lasting=True), known, within, sliding=True)
+    # A body's own links press on each other for longer than an impact: with fading, legs slip further through. What a
+    # network learned there was no better than mechanics for the lean human, and worse for the full one.
+    between, within = (SoftContacts(Rule(fades=FADES)), sizes.contact), (SoftContacts(), None)
+    return _impulsive(scene, sizes, OverMechanics(lasting=True), between, within, sliding=True)
 
 
 def paper(scene: Scene, sizes: Sizes = PAPER) -> Model:
@@ -75,10 +77,13 @@ DesignName = Literal["compact", "hybrid", "paper"]
 DESIGNS: dict[DesignName, Callable[[Scene], Model]] = {"compact": compact, "hybrid": hybrid, "paper": paper}
 
 
+_Contacts = tuple[ContactBase, Size | None]
+
+
 def _impulsive(
-    scene: Scene, sizes: Sizes, base: Base, known: ContactBase, within: ContactBase, sliding: bool = False
+    scene: Scene, sizes: Sizes, base: Base, between: _Contacts, within: _Contacts, sliding: bool = False
 ) -> Model:
-    """Bodies and contacts that are impulses, on these bases: of two bodies, and within one."""
+    """Bodies and contacts that are impulses, on these bases, with networks of these sizes: of two, within one."""
 
     def body_part(body: Body) -> BodyPart:
         if body.is_ball:
@@ -88,8 +93,7 @@ def _impulsive(
         return Articulated(body, scene.dt, scene.gravity, base, sizes.body, response)
 
     def pair_part(bodies: tuple[Body, Body], pair: Pair) -> PairPart:
-        base = within if pair.first == pair.second else known
-        return Contact(bodies, pair, scene.dt, scene.gravity, base, sizes.contact)
+        return Contact(bodies, pair, scene.dt, scene.gravity, *(within if pair.first == pair.second else between))
 
     return _made(scene, body_part, pair_part)
 

@@ -38,9 +38,9 @@ class Recipe:
 
     curriculum: (unroll in steps, share of the updates) in order. learning_rate falls to `final` of itself by a cosine.
     clip: largest gradient norm. drop: norm beyond which a batch is dropped. contact_share: windows that start from
-    `before_contact` steps before to `after_contact` steps after the first contact, of two bodies or, where `within`, of
-    a body with itself. emphasis: weight of each body's
-    links in the loss. only: beginnings of the names of the networks to train; the others stay as they are. None: all.
+    `before_contact` steps before to `after_contact` steps after the first contact of two bodies. emphasis: weight of
+    each body's links in the loss. only: beginnings of the names of the networks to train; the others stay as they are.
+    None: all.
     """
 
     updates: int = 20000
@@ -53,7 +53,6 @@ class Recipe:
     contact_share: float = 0.7
     before_contact: int = 10
     after_contact: int = 0
-    within: bool = False
     emphasis: tuple[tuple[str, float], ...] = (("ball", 3.0), ("capsule", 3.0))
     loss: LossWeights = field(default_factory=LossWeights)
     stop_gradient: bool = True
@@ -101,8 +100,7 @@ class Windows:
         self.sources, self.recipe = [source for source, _ in sources], recipe
         share = np.array([share for _, share in sources], float)
         self.share = share / share.sum()
-        touching = scene.within if recipe.within else scene.between
-        self.contacts = [first_contacts(touching, source) for source in self.sources]
+        self.contacts = [first_contacts(scene.between, source) for source in self.sources]
 
     def draw(self, random: np.random.Generator, steps: int) -> Batch:
         """Windows of so many steps."""

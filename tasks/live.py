@@ -210,7 +210,7 @@ class Live:
             if news is not None:
                 told.append(last)
                 self._told(told, wishes, task.scene.dt)
-            begun = max(begun + task.scene.dt / self.page.speed, time.monotonic() - task.scene.dt)
+            begun = due(begun, task.scene.dt / self.page.speed)
             self.page.hold(begun)
             while (ask := self.page.asked()) is not None:
                 if ask.startswith("push "):
@@ -339,6 +339,11 @@ class Live:
         found = sorted(self.folder.glob("*/summary.json"), reverse=True)
         self.kept = {path.parent.name: path.parent for path in found}
         self.page.panel.kept(list(self.kept))
+
+
+def due(last: float, step: float) -> float:
+    """When the next step is due by `time.monotonic` [s], `step` after the last: lost time is made up for by no more."""
+    return max(last + step, time.monotonic() - step)
 
 
 class Interrupted(Exception):

@@ -80,7 +80,7 @@ SCENARIOS = {
         ),
         _human("human", human_and_ball().only("human")),
         _any(ANY_HUMAN["lean"], human_and_ball(self_contact=True)),
-        _any(ANY_HUMAN["full"], human_and_ball(detail="full")),
+        _any(ANY_HUMAN["full"], human_and_ball(detail="full", self_contact=True)),
         _thrown("chain4", Scene((chain(links=4),))),
         _thrown("chains1", two_chains(1), 0.008, 0.021, 0.048, 0.173),
         _thrown("chains2", two_chains(2), 0.007, 0.023, 0.047, 0.137),

@@ -51,15 +51,11 @@ LOSS = LossWeights(velocity=1e-2, far=0.05, fast=0.1, arm=0.14)
 
 
 class Stage(NamedTuple):
-    """A part of the training: what it is called, which episodes it adds first, if any, and how it trains.
-
-    uses: beginnings of the names of the episodes that it trains on; all by default.
-    """
+    """A part of the training: what it is called, which episodes it adds first, if any, and how it trains."""
 
     name: str
     adds: Literal["", "planned", "contacts"]
     recipe: training.Recipe
-    uses: tuple[str, ...] = ("",)
 
 
 # Single steps around contacts teach impacts, at a twentieth of a rollout's price; rollouts teach the human to stay
@@ -86,13 +82,6 @@ GENERAL = (Stage("steps", "", OVER_MECHANICS),)
 # like the push.
 STRIKING_BALLS = (*GENERAL, Stage("impacts", "", IMPACTS))
 STRIKING = (*GENERAL, Stage("impacts", "", replace(IMPACTS, only=("contact", "response"), loss=LOSS)))
-# One leg on the other, the body's own motion left as it is.
-LEGS = (
-    Stage(
-        "legs", "", replace(OVER_MECHANICS, updates=2500, contact_share=0.9, before_contact=1, after_contact=8,
-        within=True, only=("contact/human-itself",)), uses=("random",),
-    ),
-)  # fmt: skip
 # Algorithm 1 of the paper, with its losses; in small batches, which are the most updates that two cores give. Where the
 # unroll grows by more at once, what worked for a few steps runs away within more.
 GROWING = ((2, 0.1), (3, 0.05), (4, 0.05), (6, 0.1), (8, 0.1), (11, 0.1), (14, 0.1), (17, 0.1), (20, 0.3))
@@ -115,10 +104,7 @@ def stages_of(chosen: Scenario) -> tuple[Stage, ...]:
     if not chosen.strikes:
         return GENERAL
     balls = any(scene.body(pair.second).is_ball for pair in scene.pairs)
-    return (
-        *(STRIKING_BALLS if balls else STRIKING),
-        *(LEGS if scene.within.pairs else ()),
-    )
+    return STRIKING_BALLS if balls else STRIKING
 
 
 def planned_episodes(kick: Kick, models: Models, tasks: int, elites: int, seed: int) -> tuple[Episodes, int]:
@@ -221,7 +207,7 @@ def main(
         rounds = content["recipe"]["rounds"]
         sizes = np.concatenate([sizes, stored.extremes(content, chosen.scene)])
     done = {each["stage"] for each in rounds}
-    if chosen.strikes and any("contacts".startswith(stage.uses) for stage in stages if stage.name not in done):
+    if chosen.strikes and any(stage.name not in done for stage in stages):
         add("contacts", partial(contact_episodes, chosen.scene, random, CONTACTS * episodes, seed + 1))
     manifest = Path()
 
@@ -247,7 +233,7 @@ def main(
             rounds = content["recipe"]["rounds"]
             continue
         longest = max(steps for steps, _ in stage.recipe.curriculum)
-        used = [(each, 1.0) for name, each in sources.items() if name.startswith(stage.uses) and each.steps >= longest]
+        used = [(each, 1.0) for each in sources.values() if each.steps >= longest]
         updates = max(1, round(effort * stage.recipe.updates))
         recipe = replace(stage.recipe, updates=updates, seed=seed + number)
         learned, log = training.train(model, recipe, used, folder / stage.name, learned)

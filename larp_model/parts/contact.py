@@ -70,6 +70,12 @@ class Push(NamedTuple):
         """Half of both."""
         return jax.tree.map(lambda a, b: 0.5 * (a + b), self, other)
 
+    @staticmethod
+    def none(met: Meeting) -> Push:
+        """Nothing beyond what is known."""
+        nothing = jnp.zeros_like(met.normal)
+        return Push(nothing, nothing[..., :1], (nothing, nothing))
+
 
 @dataclass(frozen=True)
 class Contact:
@@ -81,7 +87,8 @@ class Contact:
 
     bounds: what the network may add, so that no state, however odd, is thrown out of the world: share of the known
     change, normal speed [m/s], shares along the slide and along the four vectors of `view`, speeds up from the ground
-    [m/s], lag [ms]. grounded: height of a link above the ground at which it is not felt [m]. arm: unit of arms [m].
+    [m/s], lag [ms]. size: of the network; None where nothing is learned. grounded: height of a link above the ground at
+    which it is not felt [m]. arm: unit of arms [m].
     """
 
     bodies: tuple[Body, Body]
@@ -89,7 +96,7 @@ class Contact:
     dt: float
     gravity: float
     base: Base
-    size: Size
+    size: Size | None
     bounds: tuple[float, ...] = (1.0, 3.0, 1.0, 1.0, 1.0, 1.0, 1.0, 3.0, 3.0, 5.0)
     grounded: float = 0.03
     arm: float = 0.1
@@ -102,7 +109,7 @@ class Contact:
 
     def networks(self) -> dict[str, Perceptron]:
         """See `PairPart`."""
-        return {self.name: self.size.network(len(self.bounds))}
+        return {} if self.size is None else {self.name: self.size.network(len(self.bounds))}
 
     def meet(
         self, weights: Weights, seen: tuple[Kinematics, Kinematics], free: tuple[Velocities, Velocities]
@@ -151,6 +158,8 @@ class Contact:
 
     def measure(self, seen: tuple[Kinematics, Kinematics], free: tuple[Velocities, Velocities]) -> Measured:
         """See `PairPart`."""
+        if self.size is None:
+            return {}
         first, second = map(self.base.prepared, meeting.parties(self.pair, self.bodies, seen, free))
         met = meeting.meet(self.pair, first, second, self.dt, self.constants)
         known = self.base.known(first, second, met, self)
@@ -198,11 +207,13 @@ class Contact:
         return jnp.concatenate([*each, jnp.stack(scalars, axis=-1), *which], axis=-1)
 
     def view(self, weights: Weights, me: Party, other: Party, met: Meeting, known: Known) -> Push:
-        """What one body does to the other, by its own lights, beyond what is known.
+        """What one body does to the other, by its own lights, beyond what is known; nothing without a network.
 
         Along the normal: a share of the known change, and a speed. Across it: along the slide, and, in shares of that
         change, along the directions in which the links give way, of up, and of both arms.
         """
+        if self.size is None:
+            return Push.none(met)
         outputs = evaluate(self.networks()[self.name], weights, self.name, self.inputs(me, other, met, known))
         outputs = bounded(outputs, self.bounds) * met.near[..., None]
         scale, add, along, *shares, lift, other_lift, late = jnp.split(outputs, len(self.bounds), axis=-1)

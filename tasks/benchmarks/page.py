@@ -30,7 +30,7 @@ from tasks.benchmarks import report
 from tasks.command import remember_compilations, run
 from tasks.data import random_task
 from tasks.kick import USUAL, Kick, wished
-from tasks.live import Choices, Live, weights_for
+from tasks.live import Choices, Live, due, weights_for
 from tasks.presets import PRESETS, PresetName
 from viewer import LivePage
 
@@ -208,7 +208,7 @@ def headless(live: Live, kick: Kick, target: np.ndarray, preset: PresetName, see
 
     def observe(execution: Execution) -> None:
         nonlocal begun
-        begun = max(begun + kick.scene.dt, time.monotonic() - kick.scene.dt)
+        begun = due(begun, kick.scene.dt)
         time.sleep(max(0.0, begun - time.monotonic()))
 
     live.page.panel.playing = False
