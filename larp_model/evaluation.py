@@ -15,7 +15,7 @@ from larp_model import kinematics, rotation
 from larp_model import state as packed
 from larp_model.meeting import first_contacts
 from larp_model.networks import Weights
-from larp_model.parts.part import Model
+from larp_model.parts.part import Model, measure
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from larp_model.state import Trajectories
@@ -91,6 +91,24 @@ def evaluate(simulator: Simulator, episodes: Trajectories, windows: Sequence[int
         "diverged": int((~kept).sum()),
         "launch": {str(before): launch(simulator, episodes, before) for before in (0, 3)} if struck(scene) else {},
     }
+
+
+def novelty(simulator: Simulator, states: np.ndarray, controls: np.ndarray) -> float:
+    """How far a trajectory of states (T + 1, L, 13) under controls (T, J, 3) [rad] is from what was learned.
+
+    Root mean square, over steps and features, of what the networks of the bodies see, in standard deviations of their
+    training data, in whose mean it is 1; of the body that is furthest from its own. Contacts are left out: where links
+    are apart their networks see anything, and are not heard.
+    """
+    given = (jnp.asarray(each, jnp.float32) for each in (states[:-1], states[1:], controls))
+    return float(_novelty(simulator.model, simulator.weights, *given))
+
+
+@partial(jax.jit, static_argnums=0)
+def _novelty(model: Model, weights: Weights, before: Array, after: Array, controls: Array) -> Array:
+    seen = measure(model, before, after, controls, jnp.zeros((*before.shape[:2], 3)))
+    names = {name for part in model.bodies for name in part.networks()}
+    return jnp.stack([weights.inputs[name].novelty(seen[name][0]) for name in sorted(names)]).max()
 
 
 def distances(predicted: np.ndarray, episodes: Trajectories, steps: int) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ from jax import Array
 
 
 class Statistics(NamedTuple):
-    """Mean and spread of a feature vector (F,), from data; features that never vary keep spread 1."""
+    """Mean and spread of a feature vector (F,), from data; see `floored`."""
 
     mean: Array
     spread: Array
@@ -24,7 +24,12 @@ class Statistics(NamedTuple):
         share = (share / share.sum())[:, None]
         mean = jnp.sum(share * samples, axis=0)
         spread = jnp.sqrt(jnp.sum(share * (samples - mean) ** 2, axis=0))
-        return Statistics(mean, jnp.where(spread > 1e-5, spread, 1.0))
+        return Statistics(mean, spread)
+
+    @property
+    def floored(self) -> Statistics:
+        """To normalise with: features that never vary have spread 1."""
+        return self._replace(spread=jnp.where(self.spread > 1e-5, self.spread, 1.0))
 
     def beside(self, more: int) -> Statistics:
         """The statistics with so many features more, which are left as they are."""
@@ -33,6 +38,10 @@ class Statistics(NamedTuple):
     def normalise(self, features: Array) -> Array:
         """Features (*, F) in standard deviations from the mean."""
         return (features - self.mean) / self.spread
+
+    def novelty(self, seen: Statistics) -> Array:
+        """Root mean square of features with the statistics `seen`, in standard deviations from the mean of these."""
+        return jnp.sqrt(jnp.mean((seen.spread**2 + (seen.mean - self.mean) ** 2) / self.spread**2))
 
     def restore(self, outputs: Array) -> Array:
         """Outputs (*, F) in their own units."""

@@ -21,7 +21,7 @@ from larp_model import weights as stored
 from larp_model.scene import Scene
 from larp_model.truth.mujoco import Truth
 from mpc.loop import Execution, Replan, Window
-from tasks.models import DynamicsName
+from tasks.models import DynamicsName, Models
 from tasks.presets import Preset
 from tasks.task import REACHABLE, Planners, Run, Task
 from viewer import (
@@ -41,6 +41,8 @@ from viewer import (
 TARGETS = ((1.5, -2.5, 0.11), (6.0, 2.5, 1.5))
 SPOTS = ((-0.06, -0.06), (0.06, 0.06))
 ROLLS = ((-2.0, -2.0), (1.0, 2.0))
+# Of a plan, in what the learned model was trained on 1; beyond, the page warns. See `larp_model.evaluation.novelty`.
+NOVEL = 2.0
 # Kicks whose errors are shown.
 REMEMBERED = 30
 FILM = (960, 540)
@@ -138,12 +140,16 @@ class Live:
         key = self._key(wishes)
         if key not in self._fitted:
             task, preset = self.task(wishes.reference), self.choices.presets[wishes.preset]
-            dynamics = next(each for each in self.choices.dynamics if each == wishes.dynamics)
-            models = task.models(dynamics, self.choices.weights[wishes.weights])
+            models = self.models(wishes)
             if wishes.budget:
                 preset = task.within(preset, wishes.budget, models, wishes.target)
             self._fitted[key] = task.planners_of(preset, models)
         return self._fitted[key]
+
+    def models(self, wishes: Wishes) -> Models:
+        """The models that are wished for."""
+        dynamics = next(each for each in self.choices.dynamics if each == wishes.dynamics)
+        return self.task(wishes.reference).models(dynamics, self.choices.weights[wishes.weights])
 
     @staticmethod
     def _key(wishes: Wishes) -> tuple[str, str, str, str, float]:
@@ -185,7 +191,8 @@ class Live:
         expected = nearest_approach(path, place).distance
         reach = "" if expected <= REACHABLE else " **Out of reach:** this plan comes nearest."
         said = f"The model expects to miss by {100.0 * expected:.1f} cm, planned in {info.seconds:.2f} s."
-        self.page.tell(f"**Ready.** {said}{reach}")
+        controls = np.asarray(planner.controls(plan, wanted.controls))
+        self.page.tell(f"**Ready.** {said}{reach}\n\n{self._familiar(wishes, state, info.states, controls)}")
 
     def carry_out(self) -> None:
         """Plan and kick in the truth, with the target and the weights of each moment; then play it."""
@@ -260,6 +267,14 @@ class Live:
             else:
                 write_film(recording, path, FILM, 15.0)
             return name, path.read_bytes()
+
+    def _familiar(self, wishes: Wishes, state: np.ndarray, expected: np.ndarray, controls: np.ndarray) -> str:
+        """Whether a learned model was trained on anything like the plan; nothing where the model is the truth."""
+        found = self.models(wishes).novelty(np.concatenate([state[None], expected[: len(controls)]]), controls)
+        if found is None:
+            return ""
+        known = "as in its training" if found <= NOVEL else "**unlike its training: trust it less**"
+        return f"Novelty to the model: {found:.1f}, {known}."
 
     def _window(self, task: Task) -> Callable[[int], Window]:
         """What is set on the page at the moment of each plan."""

@@ -6,6 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
+import numpy as np
+
+from larp_model import evaluation
 from larp_model import weights as stored
 from larp_model.bodies import detail_of, human_and_ball
 from larp_model.names import require_known
@@ -34,6 +37,14 @@ class Models(NamedTuple):
     human: Dynamics
     learned: bool
     weights: str
+
+    def novelty(self, states: np.ndarray, controls: np.ndarray) -> float | None:
+        """How far a trajectory is from what the model of the scene was trained on; None where nothing is learned.
+
+        See `larp_model.evaluation.novelty`.
+        """
+        simulator = self.whole.dynamics if isinstance(self.whole, Continued) else self.whole
+        return evaluation.novelty(simulator, states, controls) if isinstance(simulator, Simulator) else None
 
 
 def shipped(scene: Scene, embedded: bool) -> Path:

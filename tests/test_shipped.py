@@ -70,6 +70,20 @@ def test_the_shipped_human_and_what_it_strikes_err_no_more_than_they_did(
     assert launch["relative_error"]["median"] < launched[0] and launch["angle_deg"]["median"] < launched[1]
 
 
+def test_what_is_like_the_training_data_has_a_novelty_of_about_one(
+    reference: Reference,
+) -> None:
+    simulator = Simulator.load("human_ball")
+    found = random_episodes(simulator.scene, reference, count=16, seed=3, steps=60)[0]
+    usual = [evaluation.novelty(simulator, *each) for each in zip(found.states, found.controls, strict=True)]
+    assert 0.5 < np.mean(usual) < 1.5 and max(usual) < 2.0
+    for columns, more in ((packed.VELOCITY, 10.0), (packed.ANGULAR_VELOCITY, 50.0), (packed.POSITION, 0.5)):
+        states = found.states[0].copy()
+        states[:, 0, columns] += more
+        assert evaluation.novelty(simulator, states, found.controls[0]) > 2.0
+    assert evaluation.novelty(simulator, found.states[0], found.controls[0] + 1.0) > 2.0
+
+
 def test_a_step_of_a_human_whose_motors_are_stronger_and_weaker_is_foreseen_as_well(reference: Reference) -> None:
     usual, random, errors = human_and_ball(), np.random.default_rng(2), []
     names = sorted({segment_of(link.name) for link in usual.body("human").links})

@@ -31,6 +31,8 @@ from viewer.stage import LEGEND, Stage, whole
 from viewer.wishes import Offer, Push, Wishes
 
 FRAME = 1.0 / 25.0  # s
+# A picture waits for so much of its time until whoever plans rests: else it takes them one of few cores.
+POLITE = 1.0
 # Pictures by which drawing may be behind what happens, where that comes in bursts.
 BEHIND = 5
 # So many clients are drawn for at that pace; more share what time there is, for each takes the planner some.
@@ -91,6 +93,8 @@ class LivePage:
         self.address = address_of(self._server)
         self.offer = offer
         self._lock, self._closed, self._moved = threading.RLock(), threading.Event(), threading.Event()
+        self._rests = threading.Event()  # while whoever plans waits for the time to come
+        self._rests.set()
         self._changes = self._frames = 0
         self._asked: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._mode: Mode = "waiting"
@@ -200,6 +204,13 @@ class LivePage:
 
     def hold(self, until: float) -> None:
         """Wait until the moment `until` of a monotonic clock [s], and for as long as time stands still on the page."""
+        self._rests.set()
+        try:
+            self._wait_for(until)
+        finally:
+            self._rests.clear()
+
+    def _wait_for(self, until: float) -> None:
         while not self._closed.is_set():
             if self._panel.playing:
                 left = until - clock.monotonic()
@@ -311,6 +322,7 @@ class LivePage:
             self._panel.play(max(each.duration for each in both), recording.scene.dt)
             self._recording, self._beside, self._drawn, self._news = recording, beside, None, None
             self._mode = "replay"
+            self._rests.set()
 
     def tell(self, text: str) -> None:
         """What is going on, in Markdown."""
@@ -352,9 +364,12 @@ class LivePage:
     # Drawing.
 
     def _draw(self) -> None:
-        last = clock.monotonic()
-        while not self._closed.wait(FRAME * max(1.0, len(self._views) / AT_FULL_PACE)):
+        last = due = clock.monotonic()
+        while not self._closed.wait(max(0.0, due - clock.monotonic())):
+            pace = FRAME * max(1.0, len(self._views) / AT_FULL_PACE)
+            self._rests.wait(POLITE * pace)
             now = clock.monotonic()
+            due = max(due + pace, now + 0.5 * pace)
             with self._lock:
                 if self._recording is not None:
                     self._draw_recording(self._recording, now - last)
@@ -394,7 +409,7 @@ class LivePage:
         lane.show(news.state, prediction=expected, reference=news.reference)
         self._frames += 1
         if news.fresh:
-            path = np.array([lane.position(state) for state in news.path]) if news.path else None
+            path = lane.position(np.array(news.path)) if news.path else None
             miss = lane.trace(path, None if plan is None else lane.position(plan), news.planned)
             if news.planned:
                 lane.fan(*(news.fan or (None, None)) if "fan" in lane.shown else (None, None))

@@ -110,6 +110,7 @@ class Capsules:
         (ball, tube), painted = unit_meshes(), np.array(colours, np.uint8)
         self.ends = batch("ends", ball, np.tile(radii, 2), np.tile(painted, (2, 1)))
         self.tubes = batch("tubes", tube, self._sizes, painted)
+        self._known = np.ones(len(links), bool)
 
     def move(self, state: np.ndarray) -> None:
         """To a state (n, 13); those that are not known (NaN) shrink to nothing."""
@@ -118,10 +119,12 @@ class Capsules:
         place, turned = state[:, POSITION], Rotation.from_quat(state[:, ORIENTATION], scalar_first=True)
         to_end = turned.apply(self._to_end)
         self.ends.batched_positions = np.concatenate([place - to_end, place + to_end])
-        self.ends.batched_scales = np.tile(known * self._sizes[:, 0], 2)
         self.tubes.batched_positions = place
         self.tubes.batched_wxyzs = (turned * self._along).as_quat(scalar_first=True)
-        self.tubes.batched_scales = known[:, None] * self._sizes
+        if not np.array_equal(known, self._known):
+            self.ends.batched_scales = np.tile(known * self._sizes[:, 0], 2)
+            self.tubes.batched_scales = known[:, None] * self._sizes
+            self._known = known
 
 
 class SceneView:

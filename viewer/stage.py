@@ -42,6 +42,7 @@ class Lane:
         }
         for ghost in self._ghosts.values():
             ghost.update(None)
+        self._lines = dict[str, viser.LineSegmentsHandle]()
         self.shown = set(self._ghosts)
         self.aim(target)
 
@@ -87,17 +88,16 @@ class Lane:
 
     def fan(self, paths: np.ndarray | None, costs: np.ndarray | None = None) -> None:
         """Draw candidates' paths (N, T, 3) [m], coloured by their costs (N,); without those that are not finite."""
+        place = f"{self._name}/path/fan"
         if paths is None or costs is None or not (sound := np.isfinite(costs)).any():
-            self._line("fan", None, TRUTH, 0.006)
+            self._server.scene.remove_by_name(place)
             return
         paths, costs = paths[sound], costs[sound]
         rank = np.argsort(np.argsort(costs)) / max(1, len(costs) - 1)
         colours = (255.0 * colormaps[FAN](CHEAP + (DEAR - CHEAP) * rank)[:, :3]).astype(np.uint8)
         segments = np.stack([paths[:, :-1], paths[:, 1:]], axis=2).reshape(-1, 2, 3)
         repeated = np.broadcast_to(colours[:, None, None], (len(paths), paths.shape[1] - 1, 2, 3)).reshape(-1, 2, 3)
-        self._server.scene.add_line_segments(
-            f"{self._name}/path/fan", segments.astype(np.float32), repeated, thickness=0.006
-        )
+        self._server.scene.add_line_segments(place, segments.astype(np.float32), repeated, thickness=0.006)
 
     def position(self, state: np.ndarray) -> np.ndarray:
         """(*, 3) [m] of the traced link in states (*, L, 13)."""
@@ -108,12 +108,17 @@ class Lane:
         self._root.remove()
 
     def _line(self, name: str, points: np.ndarray | None, colour: Colour, thickness: float) -> None:
-        place = f"{self._name}/path/{name}"
+        line = self._lines.get(name)
         if points is None or len(points) == 0:
-            self._server.scene.remove_by_name(place)
+            if line is not None:
+                line.visible = False
             return
-        segments = np.stack([points, np.roll(points, -1, axis=0)], axis=1)[: max(1, len(points) - 1)]
-        self._server.scene.add_line_segments(place, segments.astype(np.float32), colour, thickness=thickness)
+        segments = np.stack([points, np.roll(points, -1, axis=0)], axis=1)[: max(1, len(points) - 1)].astype(np.float32)
+        if line is None:
+            place = f"{self._name}/path/{name}"
+            self._lines[name] = self._server.scene.add_line_segments(place, segments, colour, thickness=thickness)
+        else:  # a line that is there takes new points at a fraction of what another takes
+            line.points, line.visible = segments, True
 
 
 class Stage:

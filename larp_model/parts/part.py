@@ -165,8 +165,8 @@ def initial_weights(model: Model, key: Array, statistics: Measured) -> Weights:
     for index, (name, module) in enumerate(sorted(model.networks().items())):
         size = statistics[name][0].mean.shape[0]
         networks[name] = module.init(jax.random.fold_in(key, index), jnp.zeros((1, size)))
-    inputs = {name: statistics[name][0] for name in networks}
-    outputs = {name: found for name in networks if (found := statistics[name][1]) is not None}
+    inputs = {name: statistics[name][0].floored for name in networks}
+    outputs = {name: found.floored for name in networks if (found := statistics[name][1]) is not None}
     return Weights(networks, inputs, outputs)
 
 
