@@ -81,6 +81,25 @@ class Execution:
     replans: list[Replan] = field(default_factory=list)
 
 
+class Begun(NamedTuple):
+    """What must be known of an execution that was cut off to go on with it.
+
+    states (T + 1, L, 13) and controls (T, J, 3) [rad] so far; the last plan, the step and the phase it was made in.
+    """
+
+    states: np.ndarray
+    controls: np.ndarray
+    plan: Plan
+    step: int
+    phase: int
+
+    @staticmethod
+    def of(execution: Execution) -> Begun:
+        """An execution so far."""
+        last = execution.replans[-1]
+        return Begun(np.stack(execution.states), np.stack(execution.controls), last.plan, last.step, last.phase)
+
+
 def execute(
     world: World,
     state: np.ndarray,
@@ -90,18 +109,24 @@ def execute(
     dt: float,
     observe: Callable[[Execution], None] = lambda execution: None,
     sense: Callable[[np.ndarray], np.ndarray] = lambda state: state,
+    begun: Begun | None = None,
 ) -> Execution:
     """Plan in the true state, from state (L, 13) on, execute and plan again, one phase after the other.
 
     After the last phase its plan is carried out, and after the plan's end the task's reference. `observe` is called
-    after every step. sense: what the planners are shown of a true state (L, 13); all of it by default. Raises
-    `Diverged` as soon as the world does.
+    after every step. sense: what the planners are shown of a true state (L, 13); all of it by default. begun: to go
+    on with, from the state it has reached; the plans found are then those from there on. Raises `Diverged` as soon as
+    the world does.
     """
-    world.reset(state[None])
     execution = Execution([np.asarray(state)])
     index, plan, planned_at, targets = 0, None, 0, np.zeros(0)
     ends: int | None = None
-    for step in range(steps):
+    if begun is not None:
+        execution = Execution([*begun.states], [*begun.controls])
+        plan, planned_at, index = begun.plan, begun.step, begun.phase
+        targets = np.asarray(phases[index].again.controls(plan, phases[index].window(planned_at).controls))
+    world.reset(execution.states[-1][None])
+    for step in range(len(execution.controls), steps):
         current = sense(execution.states[-1])
         while index < len(phases):
             if ends is None and phases[index].over(step, current):

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import tyro
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 
@@ -54,6 +55,19 @@ class Teller:
         self._console.print(f"{what} ...", end=" ")
         yield
         self._console.print(f"{time.perf_counter() - begin:.1f} s")
+
+    @contextmanager
+    def bar(self, what: str) -> Iterator[Callable[[int, int], None]]:
+        """Show how far a part is and how long it still takes; to be told how much is done, of how much."""
+        with Progress(
+            TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=self._console
+        ) as progress:
+            task = progress.add_task(what, total=None)
+
+            def at(done: int, whole: int) -> None:
+                progress.update(task, completed=done, total=whole)
+
+            yield at
 
     def result(self, table: Table, summary: dict[str, Any]) -> None:
         """Show the result: the table, or the summary as JSON."""

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import io
 import json as text
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -24,20 +26,29 @@ from larp_model.files import require_writable, write_whole
 from larp_model.scene import Body, Scene
 from larp_model.simulator import Simulator
 from larp_model.truth.mujoco import SUBSTEPS, Truth
-from mpc import Dynamics, GaussNewton, MujocoDynamics, PlanInfo
+from mpc import Dynamics, GaussNewton, MujocoDynamics
+from mpc.loop import Begun, Execution
 from tasks.command import Teller, remember_compilations, run
 from tasks.keypoints import camera as cameras
 from tasks.keypoints import formats, lift, physical
+from tasks.keypoints.kept import Kept, Spent, fingerprint
 from tasks.keypoints.picture import pose_picture
 from tasks.keypoints.points import Keypoints
 from tasks.models import ROWS, DynamicsName
 from tasks.motions import angles, bvh
 from tasks.scenarios import ANY_HUMAN
+from viewer import Overlay, write_overlay
 
 # Of each plan.
 STEPS = GaussNewton(rounds=2, directions=32)
 # Of states and controls [s], as every scene's by default.
 DT = 0.01
+# Of the learned model, whatever a film shows.
+MANIFEST = stored.SHIPPED / f"{ANY_HUMAN['lean']}.json"
+# Keypoints are shown so far before the points they belong to [m], or these would hide them.
+BEFORE = 0.2
+# What is done is kept every so many seconds.
+OFTEN = 5.0
 # Frames that are needed, and a median error [shares of the image] beyond which the figure does not fit the person.
 LEAST, ASTRAY = 10, 0.03
 
@@ -77,8 +88,8 @@ class Reconstruction(NamedTuple):
     """What a film shows, before physics and after.
 
     lifted: see `lift.Lifted`. body: as it was simulated. start, found: points (T, P, 3) [m] in every frame, of the
-    kinematic start and of what was executed. wanted: the start at every step. states: (N, L, 13), executed. plans: what
-    each planning step found out.
+    kinematic start and of what was executed. wanted: the start at every step. states: (N, L, 13), executed.
+    spent: what planning took.
     """
 
     lifted: lift.Lifted
@@ -87,7 +98,7 @@ class Reconstruction(NamedTuple):
     found: np.ndarray
     wanted: physical.Wanted
     states: np.ndarray
-    plans: list[PlanInfo]
+    spent: Spent
 
     @property
     def fell(self) -> bool:
@@ -95,27 +106,65 @@ class Reconstruction(NamedTuple):
         return bool((self.states[:, 0, 2] < 0.5 * standing_height(self.body)).any())
 
 
-def reconstruct(film: Keypoints, lifted: lift.Lifted, dynamics: DynamicsName = "larp", seed: int = 0) -> Reconstruction:
-    """The physical motion from the kinematic start on, by a planner whose model is LARP or MuJoCo."""
-    manifest, figure = stored.SHIPPED / f"{ANY_HUMAN['lean']}.json", lift.figure()
-    body = simulated(figure, lifted.proportions, manifest)
+def reconstruct(
+    film: Keypoints,
+    lifted: lift.Lifted,
+    dynamics: DynamicsName = "larp",
+    seed: int = 0,
+    kept: Kept | None = None,
+    at: Callable[[int, int], None] = lambda step, steps: None,
+) -> Reconstruction:
+    """The physical motion from the kinematic start on, by a planner whose model is LARP or MuJoCo.
+
+    kept: to go on from, and to keep what is done in. at: called after every step, with their number.
+    """
+    figure = lift.figure()
+    body = simulated(figure, lifted.proportions, MANIFEST)
     scene = Scene((body,), dt=DT)
     model: Dynamics
     if dynamics == "larp":
-        model = Simulator(*stored.load(manifest, scene)[:2])
+        model = Simulator(*stored.load(MANIFEST, scene)[:2])
     else:
         model = MujocoDynamics(Truth(scene, ROWS, SUBSTEPS))
     wanted = physical.wanted_of(scene, figure, lifted, film)
     points = physical.Seen(body, figure, lifted.proportions)
     sigma = lift.PIXELS * 2.0 * float(np.max(lifted.camera.centre))
     planner = physical.planner_of(scene, points, lifted.camera, sigma, model, (STEPS,))
-    execution = physical.fit(scene, planner, wanted, physical.started(scene, wanted), seed)
+    spent, counted, saved = Spent() if kept is None else kept.spent, 0, time.monotonic()
+
+    def observe(execution: Execution) -> None:
+        nonlocal spent, counted, saved
+        for replan in execution.replans[counted:]:
+            spent = spent.and_by(replan.info)
+        counted = len(execution.replans)
+        if kept is not None and counted and time.monotonic() - saved > OFTEN:
+            kept.keep(lifted, Begun.of(execution), spent)
+            saved = time.monotonic()
+        at(len(execution.controls), len(wanted.states) - 1)
+
+    begun, state = None if kept is None else kept.begun, physical.started(scene, wanted)
+    execution = physical.fit(scene, planner, wanted, state, seed, observe, begun)
     states = np.stack(execution.states)
-    at = np.minimum(np.rint(np.arange(len(film)) / film.rate / scene.dt).astype(int), len(states) - 1)
+    frames = np.minimum(np.rint(np.arange(len(film)) / film.rate / scene.dt).astype(int), len(states) - 1)
     return Reconstruction(
         lifted, body, figure.all_points(lifted.pose, lifted.proportions),
-        np.asarray(points.points(states[at].astype(np.float32)), float), wanted, states,
-        [replan.info for replan in execution.replans],
+        np.asarray(points.points(states[frames].astype(np.float32)), float), wanted, states,
+        spent,
+    )  # fmt: skip
+
+
+def overlay_of(film: Keypoints, made: Reconstruction) -> Overlay:
+    """The motion under the keypoints, for a page."""
+    lens = made.lifted.camera
+    position, turn = np.asarray(lens.position, float), np.asarray(lens.turn, float)
+    depth = (made.found - position) @ turn[2]
+    places = np.where(film.seen[..., None], film.places, np.nan), lens.project(made.found)
+    seen, found = (position + (depth - BEFORE)[..., None] * lens.ray(each) for each in places)
+    ahead = position + float(np.median(depth)) * lens.ray(np.asarray(lens.centre, float))
+    return Overlay(
+        Scene((made.body,), dt=DT), made.states, made.wanted.states, seen, found, film.rate, (position, ahead),
+        2.0 * float(np.arctan(np.asarray(lens.centre)[1] / lens.focal)),
+        summary=(f"{len(film)} frames, {len(film) / film.rate:.1f} s", "fell" if made.fell else "did not fall"),
     )  # fmt: skip
 
 
@@ -131,7 +180,7 @@ def main(
     quiet: bool = False,
     json: bool = False,
 ) -> None:
-    """Motion in 3D from the 2D keypoints of a film.
+    """Motion in 3D from the 2D keypoints of a film. A run that was cut off goes on where it was.
 
     Args:
         keypoints: of OpenPose (a folder), AlphaPose, MMPose or MediaPipe (JSON), or npz.
@@ -142,7 +191,8 @@ def main(
         person: which of several, in order of appearance from 0; the one who is seen best by default.
         dynamics: the planner's model: larp (learned) or mujoco.
         seed: of the planner's random numbers.
-        out: folder for summary.json, pose.npz and pose.bvh (each a reference for tasks.kick), and pose.png.
+        out: folder for summary.json, pose.npz and pose.bvh (each a reference for tasks.kick), pose.png,
+            and pose.html, a replay under the keypoints.
         quiet: print nothing.
         json: print the summary as JSON, and on stderr what else is told.
     """
@@ -159,13 +209,26 @@ def main(
     tell = Teller(quiet, json)
     if loaded.crossed:
         tell(f"another person is before or behind this one in {loaded.crossed} frames: look at them in pose.png")
-    with tell.part(f"laying a figure over {len(film)} frames"):
-        lifted = lift.lift(film, lens, known)
+    given = (
+        film.places,
+        film.confidence,
+        film.rate,
+        lens.focal,
+        *map(np.asarray, (lens.centre, lens.turn, lens.position)),
+    )
+    kept = Kept(out / "unfinished.npz", fingerprint(*given, known, dynamics, seed, MANIFEST.read_bytes()))
+    if kept.lifted is None:
+        with tell.part(f"laying a figure over {len(film)} frames"):
+            lifted = lift.lift(film, lens, known)
+        kept.keep(lifted)
+    else:
+        lifted = kept.lifted
+        tell(f"going on from {out}/unfinished.npz, {0 if kept.begun is None else len(kept.begun.controls)} steps done")
     image = 2.0 * np.asarray(lens.centre)
     if lifted.error > ASTRAY * image.max():
         tell(f"half of the points are more than {lifted.error:.0f} px off: does the camera move, or is it another one?")
-    tell("planning and executing; what is new is compiled first")
-    made = reconstruct(film, lifted, dynamics, seed)
+    with tell.bar("planning and executing") as at:
+        made = reconstruct(film, lifted, dynamics, seed, kept, at)
     apart = np.linalg.norm(lifted.camera.project(made.found) - film.places, axis=-1)[film.seen]
     summary = {
         "frames": len(film),
@@ -178,10 +241,10 @@ def main(
         "kinematic_error_px": lifted.error,
         "error_px": float(np.median(apart)),
         "fell": made.fell,
-        "plan_seconds": float(sum(info.seconds for info in made.plans)),
-        "compile_seconds": float(sum(info.compile_seconds for info in made.plans)),
-        "candidates": int(sum(info.candidates for info in made.plans)),
-        "candidates_lost": int(sum(info.candidates - info.finite for info in made.plans)),
+        "plan_seconds": made.spent.seconds,
+        "compile_seconds": made.spent.compile_seconds,
+        "candidates": made.spent.candidates,
+        "candidates_lost": made.spent.lost,
         "dynamics": dynamics,
         "seed": seed,
     }
@@ -196,13 +259,15 @@ def main(
     told.add_row("fell", "yes" if made.fell else "no")
     told.add_row("planning", f"{summary['plan_seconds']:.1f} s, {summary['candidates']} candidates")
     tell.result(told, summary)
-    buffer, given = io.BytesIO(), angles_of(made.wanted.states if made.fell else made.states, made.body, DT)
-    np.savez_compressed(buffer, **given)
+    buffer, motion = io.BytesIO(), angles_of(made.wanted.states if made.fell else made.states, made.body, DT)
+    np.savez_compressed(buffer, **motion)
     write_whole(out / "pose.npz", buffer.getvalue())
-    write_whole(out / "pose.bvh", bvh.dumps(angles.motion(**given)).encode())
+    write_whole(out / "pose.bvh", bvh.dumps(angles.motion(**motion)).encode())
     pose_picture(film, lifted.camera, made.found, made.start, out / "pose.png")
+    write_overlay(overlay_of(film, made), out / "pose.html")
     write_whole(out / "summary.json", (text.dumps(summary, indent=2) + "\n").encode())
-    tell(f"{out}/: summary.json, pose.npz, pose.bvh, pose.png")
+    kept.done()
+    tell(f"{out}/: summary.json, pose.npz, pose.bvh, pose.png, pose.html")
 
 
 def cli() -> None:

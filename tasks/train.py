@@ -179,6 +179,8 @@ def main(
         seed: of the data and the training; the benchmarks use seeds below 100.
         start: manifest of weights to go on from: stages that they have been through are left out.
     """
+    if start and size:
+        raise ValueError(f"size is {size!r}, but the networks of weights to go on from keep their own: leave it out")
     console, chosen = Console(), scenario(scene)
     folder = folder or trained_at(chosen.name, design, size)
     remember_compilations()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mpc import CEM, CostTerm, GaussNewton, Plan, Planner, Verified
-from mpc.loop import Phase, Window, execute
+from mpc.loop import Begun, Phase, Window, execute
 
 HORIZON, DT = 6, 0.01
 
@@ -111,6 +111,18 @@ def test_a_phase_with_the_planner_of_the_one_before_goes_on_with_its_plan() -> N
     ]  # fmt: skip
     alone = execute(World(), START, phases[:1], 6, jax.random.key(0), DT)
     np.testing.assert_array_equal(execution.states[:7], alone.states)
+
+
+@pytest.mark.parametrize("cut", [1, 4, 7, 11])
+def test_an_execution_that_was_cut_off_goes_on_as_if_it_had_not_been(cut: int) -> None:
+    one, other = _planner(), _planner()
+    phases = (Phase(one, one, 2, _window, lambda step, state: step == 5), Phase(other, other, 3, _window))
+    whole = execute(World(), START, phases, 14, jax.random.key(0), DT)
+    part = execute(World(), START, phases, cut, jax.random.key(0), DT)
+    rest = execute(World(), START, phases, 14, jax.random.key(0), DT, begun=Begun.of(part))
+    np.testing.assert_array_equal(rest.states, whole.states)
+    np.testing.assert_array_equal(rest.controls, whole.controls)
+    assert [each.step for each in (*part.replans, *rest.replans)] == [each.step for each in whole.replans]
 
 
 def test_planners_see_what_is_sensed_and_the_truth_goes_on_from_the_truth() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,10 @@ import pytest
 from larp_model.bodies import human_and_ball
 from tasks import pose
 from tasks.benchmarks import pose as benchmark
-from tasks.command import run
+from tasks.command import Teller, run
 from tasks.keypoints import filmed, lift, metrics, physical
 from tasks.keypoints.figure import SHARED
+from tasks.keypoints.kept import Kept
 from tasks.keypoints.points import POINTS, Keypoints
 from tasks.motions import angles, bvh
 from tasks.motions.references import embedded
@@ -56,6 +58,45 @@ def test_a_film_becomes_a_motion_in_mujoco_and_a_reference(film: dict[str, Any],
     hips, true = motion.path("Hips"), metrics.pelvis(film["true"])[:, 0]
     moved = np.linalg.norm(hips[-1] - hips[0]), np.linalg.norm(true[-1] - true[0])
     assert moved[0] == pytest.approx(moved[1], abs=0.2)
+
+
+def test_a_reconstruction_that_was_cut_off_goes_on_as_if_it_had_not_been(
+    film: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(pose, "OFTEN", 0.0)
+    whole, again = tmp_path / "whole", tmp_path / "again"
+    short = film["keypoints"].cut(0, 19)
+    keypoints = written(tmp_path, short)
+    pose.main(keypoints, out=whole, quiet=True)
+
+    def interrupted(step: int, steps: int) -> None:
+        if step >= 17:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as changed:
+        changed.setattr(Teller, "bar", lambda self, what: nullcontext(interrupted))
+        with pytest.raises(KeyboardInterrupt):
+            pose.main(keypoints, out=again, quiet=True)
+    assert [path.name for path in again.iterdir()] == ["unfinished.npz"]
+    capsys.readouterr()
+    pose.main(keypoints, out=again)
+    assert "17 steps done" in capsys.readouterr().out
+    assert sorted(path.name for path in again.iterdir()) == sorted(path.name for path in whole.iterdir())
+    one, other = (angles.load(folder / "pose.npz") for folder in (whole, again))
+    np.testing.assert_allclose(other.path("Hips"), one.path("Hips"), atol=0.01)
+    first, second = (json.loads((folder / "summary.json").read_text()) for folder in (whole, again))
+    assert first["candidates"] == second["candidates"]
+
+
+def test_what_was_kept_of_another_film_or_is_damaged_is_of_no_use(film: dict[str, Any], tmp_path: Path) -> None:
+    path = tmp_path / "unfinished.npz"
+    found = lift.Lifted(lift.Pose(*(np.zeros(2),) * 3), np.zeros(11), film["lens"], 1.0)
+    Kept(path, "one").keep(found)
+    again = Kept(path, "one")
+    assert again.lifted is not None and again.lifted.error == 1.0 and again.begun is None
+    assert Kept(path, "other").lifted is None
+    path.write_bytes(path.read_bytes()[:-80])
+    assert Kept(path, "one").lifted is None
 
 
 def test_frames_at_the_ends_in_which_nobody_is_seen_are_left_out(film: dict[str, Any]) -> None:

@@ -139,6 +139,12 @@ def test_training_that_goes_on_keeps_the_mechanics_that_the_weights_correct(tmp_
     assert after == before
 
 
+def test_training_that_goes_on_is_asked_for_no_size(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="size is 'tiny', but the networks of weights to go on from keep their own"):
+        train.main(scene="chain4", size="tiny", folder=tmp_path / "run", start=stored.SHIPPED / "chain4.json")
+    assert not (tmp_path / "run").exists()
+
+
 def test_other_bodies_than_a_human_are_not_asked_for_another_kick(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="reference is asked for, but the scene chains1 has no human"):
         model.main(scene="chains1", reference=Path("kick.bvh"), json=tmp_path / "model.json")

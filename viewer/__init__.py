@@ -2,6 +2,7 @@
 
 from viewer.app import LivePage, Stopped, show
 from viewer.film import check_film, write_film
+from viewer.overlay import Overlay, overlay_page, write_overlay
 from viewer.picture import kick_picture
 from viewer.recording import Approach, Recording, nearest_approach
 from viewer.replay import framed, page_of, write_html
@@ -12,6 +13,7 @@ __all__ = [
     "Approach",
     "LivePage",
     "Offer",
+    "Overlay",
     "Push",
     "Recording",
     "SceneView",
@@ -21,8 +23,10 @@ __all__ = [
     "framed",
     "kick_picture",
     "nearest_approach",
+    "overlay_page",
     "page_of",
     "show",
     "write_film",
     "write_html",
+    "write_overlay",
 ]

@@ -44,8 +44,12 @@ def page_of(recording: Recording) -> str:
     finally:
         close_server(server)
     facts = {"nearest to the target": f"{100.0 * miss:.1f} cm", **recording.summary}
-    title = escape(recording.title or "Replay")
-    lines = [*(f"{name}: {text}" for name, text in facts.items()), LEGEND]
+    return captioned(page, recording.title or "Replay", [*(f"{name}: {text}" for name, text in facts.items()), LEGEND])
+
+
+def captioned(page: str, title: str, lines: list[str]) -> str:
+    """The page with its title, and these lines in a corner."""
+    title = escape(title)
     caption = "<br>".join([f"<b>{title}</b>", *map(escape, lines)])
     head, _, rest = page.partition("<title>")
     page = f"{head}<title>{title}{rest[rest.index('</title>') :]}"

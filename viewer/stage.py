@@ -169,8 +169,8 @@ def whole(recording: Recording) -> np.ndarray:
     return np.concatenate([recording.states[0, :, POSITION], recording.path[: approach.row + 2], target[None]])
 
 
-def _pitch(server: viser.ViserServer) -> None:
-    """The ground with a grid of metres and their numbers, and a goal."""
+def ground(server: viser.ViserServer) -> None:
+    """The ground with a grid of metres."""
     server.scene.add_grid(
         "/ground",
         60.0,
@@ -185,6 +185,11 @@ def _pitch(server: viser.ViserServer) -> None:
         shadow_opacity=0.3,
         fade_distance=30.0,
     )
+
+
+def _pitch(server: viser.ViserServer) -> None:
+    """The ground with a grid of metres and their numbers, and a goal."""
+    ground(server)
     for metre in range(1, FAR + 1):
         server.scene.add_label(
             f"/ground/{metre}",

@@ -90,12 +90,10 @@ def measured(clip: Path | None, camera: int, seconds: float, ways: Sequence[Way]
             row[way] = judged(lift.figure().all_points(lifted.pose, lifted.proportions))
             continue
         made = reconstruct(film, lifted, names[way], seed)
-        planning = sum(info.seconds for info in made.plans)
-        candidates = sum(info.candidates for info in made.plans)
         row[way] = judged(made.found) | {
             "fell": 100.0 * made.fell,
-            "plan_seconds": planning,
-            "ms_per_candidate": 1e3 * planning / candidates,
+            "plan_seconds": made.spent.seconds,
+            "ms_per_candidate": 1e3 * made.spent.seconds / made.spent.candidates,
         }
     return row
 

@@ -59,6 +59,10 @@ PACE, MOVED = 0.9, 5.0
 STEPS = 40
 # Of what is not known of a camera: tilts [rad], and its height as a share.
 TILT, ROLL, HEIGHT = 0.3, 0.05, 0.3
+# Of the body's size where it is not known how high a camera stands: no image tells it, and what is small jerks least.
+UNSEEN = 0.005
+# Tilts from which the least costly is taken, the height [m] that a person is above the ground there, and frames tried.
+TILTS, AFLOAT, FEW = (-0.1, 0.0, 0.1, 0.2, 0.3, 0.45), 0.1, 6
 # Of where the weight is borne, beside the feet that stand [m]; the mass that is nearest to each point, as a share.
 BORNE = 0.08
 MASSES = {"nose": 0.07, "shoulder": 0.16, "elbow": 0.035, "wrist": 0.02, "hip": 0.16, "knee": 0.06, "ankle": 0.03}
@@ -145,6 +149,12 @@ def _tilted(camera: Camera, unknown: Array) -> Camera:
     return Camera(camera.focal, jnp.asarray(camera.centre), turn @ jnp.asarray(camera.turn), position)
 
 
+def _seen_by(camera: Camera, shared: np.ndarray) -> Camera:
+    """The camera as what is shared says that it is turned and raised."""
+    tilted = _tilted(camera, jnp.asarray(shared[SHARED : SHARED + 3]))
+    return Camera(camera.focal, camera.centre, np.asarray(tilted.turn, float), np.asarray(tilted.position, float))
+
+
 def _moved(body: Figure, camera: Camera, turn: Array, change: Array, shared: Array) -> tuple[Array, Array]:
     """Points (P, 3) [m] and their places (P, 2) [px]; change: place, turn, angles; shared: proportions, camera."""
     turned = matrix(from_rotation_vector(change[3:6])) @ turn
@@ -156,12 +166,12 @@ class _Lifter:
     """The equations of one film."""
 
     def __init__(self, keypoints: Keypoints, camera: Camera, known: bool) -> None:
-        self.keypoints, self.camera, self.figure = keypoints, camera, figure()
+        self.keypoints, self.camera, self.known, self.figure = keypoints, camera, known, figure()
         size = keypoints.size or tuple(2.0 * camera.centre)
         self.sigma = PIXELS * max(size)
         self.mean, self.whitening, self.starts = usual_poses()
-        tight = np.full(3, 1e-4)
-        self.shared_sigma = np.concatenate([[GROWN], VARIED, tight if known else [TILT, ROLL, HEIGHT], [SOLES, SOLES]])
+        grown, unknown = (GROWN, (1e-4, 1e-4, 1e-4)) if known else (UNSEEN, (TILT, ROLL, HEIGHT))
+        self.shared_sigma = np.array([grown, *VARIED, *unknown, SOLES, SOLES])
         self.values = jax.jit(jax.vmap(partial(_moved, self.figure, camera), (0, 0, None)))
         both = jax.jacfwd(partial(_moved, self.figure, camera), (1, 2))
         self.slopes = jax.jit(jax.vmap(both, (0, 0, None)))
@@ -214,22 +224,23 @@ class _Lifter:
         over_starts = jax.vmap(improved, (0, 0, None, None, None))
         return jax.jit(jax.vmap(over_starts, (0, 0, 0, None, None)))
 
-    def begun(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def begun(self, frames: np.ndarray, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Turns (F, S, 3, 3) and changes (F, S, D): every heading and usual pose, as far away as the image is small."""
+        camera = _seen_by(self.camera, shared)
         headings = np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False)
         turns = np.repeat(Rotation.from_rotvec(headings[:, None] * (0.0, 0.0, 1.0)).as_matrix(), POSES, axis=0)
         angles = np.tile(self.starts, (HEADINGS, 1, 1))
         pose = Pose(np.zeros((len(turns), 3)), turns, angles)
         around = self.figure.all_points(pose, np.zeros(SHARED))
-        local = around @ self.camera.turn.T
+        local = around @ camera.turn.T
         begin = np.zeros((len(frames), len(turns), 6 + 3 * self.figure.joints))
         for row, frame in enumerate(frames):
             seen = self.keypoints.seen[frame]
             places = self.keypoints.places[frame, seen]
             spread = np.sqrt(local[:, seen, :2].var(axis=1).sum(axis=-1))
-            depth = np.clip(self.camera.focal * spread / max(np.sqrt(places.var(axis=0).sum()), 1.0), 1.0, 60.0)
-            ray = self.camera.ray(places.mean(axis=0))
-            begin[row, :, :3] = self.camera.position + depth[:, None] * ray - around[:, seen].mean(axis=1)
+            depth = np.clip(camera.focal * spread / max(np.sqrt(places.var(axis=0).sum()), 1.0), 1.0, 60.0)
+            ray = camera.ray(places.mean(axis=0))
+            begin[row, :, :3] = camera.position + depth[:, None] * ray - around[:, seen].mean(axis=1)
         begin[:, :, 6:] = angles.reshape(len(angles), -1)
         return np.broadcast_to(turns, (len(frames), *turns.shape)), begin
 
@@ -266,10 +277,29 @@ class _Lifter:
         rows = np.arange(len(self.frames)), self.sequence(self.frames, points, costs)
         return _between(self.frames, changes[rows], turns[rows], len(self.keypoints))
 
-    def first(self) -> Pose:
+    def first(self, shared: np.ndarray) -> Pose:
         """A pose in all frames, from nothing."""
-        size = 6 + 3 * self.figure.joints
-        return self.chosen(*self.begun(self.frames), np.ones(size), np.zeros(len(self.shared_sigma)))
+        return self.chosen(*self.begun(self.frames, shared), self.free, shared)
+
+    def tilted(self) -> np.ndarray:
+        """What is shared at first: the tilt at which some frames, solved alone, show a person on the ground."""
+        frames, found = self.frames[:: max(1, len(self.frames) // FEW)], []
+        for tilt in TILTS:
+            shared = np.zeros(len(self.shared_sigma))
+            shared[SHARED] = tilt
+            turns, changes, costs = self.alone(frames, *self.begun(frames, shared), self.free, shared)
+            pose = Pose(changes[..., :3], turns, changes[..., 6:].reshape(*costs.shape, -1, 3))
+            flat = Pose(*(each.reshape(-1, *each.shape[2:]) for each in pose))
+            lowest = self.figure.all_points(flat, shared[:SHARED])[:, FEET, 2].min(axis=1).reshape(costs.shape) - SOLE
+            found.append(
+                (float((costs + (lowest / AFLOAT) ** 2).min(axis=1).mean()) + (tilt / TILT) ** 2, tilt, shared)
+            )
+        return min(found, key=lambda each: each[0])[2]
+
+    @property
+    def free(self) -> np.ndarray:
+        """Every degree of freedom of a frame (D,)."""
+        return np.ones(6 + 3 * self.figure.joints)
 
     def rethought(self, pose: Pose, shared: np.ndarray, limb: tuple[int, ...]) -> Pose:
         """The pose, the joints of one limb in another way where a sequence of such ways fits better."""
@@ -306,7 +336,8 @@ class _Lifter:
 
     def solved(self) -> tuple[Pose, np.ndarray]:
         """The pose and what is shared."""
-        pose, shared = self.together(self.first(), np.zeros(len(self.shared_sigma)), STEPS // 2)
+        begin = np.zeros(len(self.shared_sigma)) if self.known else self.tilted()
+        pose, shared = self.together(self.first(begin), begin, STEPS // 2)
         names = [self.figure.body.links[child].name for child, _, _ in self.figure.body.motors]
         for side in SIDES:
             for limb in LIMBS:
@@ -505,7 +536,5 @@ def lift(keypoints: Keypoints, camera: Camera, known: bool = True) -> Lifted:
     lifter = _Lifter(keypoints, camera, known)
     pose, shared = lifter.solved()
     apart = np.linalg.norm(lifter.now(pose, shared).places - keypoints.places, axis=-1)
-    if not known:
-        tilted = _tilted(camera, jnp.asarray(shared[SHARED : SHARED + 3]))
-        camera = Camera(camera.focal, camera.centre, np.asarray(tilted.turn, float), np.asarray(tilted.position, float))
-    return Lifted(pose, shared[:SHARED], camera, float(np.nanmedian(apart)))
+    found = camera if known else _seen_by(camera, shared)
+    return Lifted(pose, shared[:SHARED], found, float(np.nanmedian(apart)))

@@ -14,6 +14,7 @@ or MuJoCo; what comes out is what MuJoCo did.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -27,7 +28,7 @@ from larp_model.rotation import matrix
 from larp_model.scene import Body, Scene, anchor
 from larp_model.truth.mujoco import Truth, closed
 from mpc import CostTerm, Dynamics, Optimizer, Planner, quadratic
-from mpc.loop import Execution, Phase, Window, execute
+from mpc.loop import Begun, Execution, Phase, Window, execute
 from tasks.data import stray
 from tasks.keypoints.camera import Camera
 from tasks.keypoints.figure import Figure, Pose
@@ -178,9 +179,10 @@ def started(scene: Scene, wanted: Wanted) -> np.ndarray:
 
 
 def fit(
-    scene: Scene, planner: Planner, wanted: Wanted, state: np.ndarray, seed: int = 0
+    scene: Scene, planner: Planner, wanted: Wanted, state: np.ndarray, seed: int = 0,
+    observe: Callable[[Execution], None] = lambda execution: None, begun: Begun | None = None,
 ) -> Execution:  # fmt: skip
-    """Plan and execute in the truth, from a state (L, 13) on, until what is wanted ends."""
+    """Plan and execute in the truth, from a state (L, 13) on, until what is wanted ends; see `mpc.loop.execute`."""
     steps = len(wanted.states) - 1
 
     def window(step: int) -> Window:
@@ -190,4 +192,4 @@ def fit(
         return Window(wanted.targets[now], context)
 
     phase = Phase(planner, planner, EVERY, window)
-    return execute(Truth(scene, 1), state, [phase], steps, jax.random.key(seed), scene.dt)
+    return execute(Truth(scene, 1), state, [phase], steps, jax.random.key(seed), scene.dt, observe, begun=begun)

@@ -1,0 +1,105 @@
+"""What is kept of a reconstruction on its way, so that one that was cut off goes on where it was."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from larp_model.files import write_whole
+from mpc import Plan, PlanInfo
+from mpc.loop import Begun
+from tasks.keypoints.camera import Camera
+from tasks.keypoints.figure import Pose
+from tasks.keypoints.lift import Lifted
+
+
+class Spent(NamedTuple):
+    """What planning has taken: seconds, those of compiling apart, candidates, and how many of them were lost."""
+
+    seconds: float = 0.0
+    compile_seconds: float = 0.0
+    candidates: int = 0
+    lost: int = 0
+
+    def and_by(self, info: PlanInfo) -> Spent:
+        """With another planning step."""
+        lost = info.candidates - info.finite
+        return Spent(
+            self.seconds + info.seconds,
+            self.compile_seconds + info.compile_seconds,
+            self.candidates + info.candidates,
+            self.lost + lost,
+        )
+
+
+class Kept:
+    """What is known so far, in a file that is of use only to who does the same again.
+
+    lifted: the kinematic start; begun: what was executed of the physical fit; each None while there is none.
+    """
+
+    lifted: Lifted | None = None
+    begun: Begun | None = None
+    spent: Spent = Spent()
+
+    def __init__(self, path: Path, made_by: str) -> None:
+        """path: npz. made_by: see `fingerprint`; of what was done otherwise, or is damaged, nothing is taken."""
+        self._path, self._made_by = path, made_by
+        try:
+            with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+                if str(file["made_by"]) == made_by:
+                    self._take({name: file[name] for name in file.files})
+        except Exception:  # numpy and zipfile raise many kinds for a damaged file
+            self.lifted, self.begun, self.spent = None, None, Spent()
+
+    def keep(self, lifted: Lifted, begun: Begun | None = None, spent: Spent = Spent()) -> None:  # noqa: B008
+        """Write what is known."""
+        camera = lifted.camera
+        content: dict[str, Any] = {
+            "made_by": self._made_by,
+            **{f"pose_{name}": value for name, value in lifted.pose._asdict().items()},
+            **{f"camera_{name}": getattr(camera, name) for name in ("focal", "centre", "turn", "position")},
+            "proportions": lifted.proportions,
+            "error": lifted.error,
+            "spent": np.array(spent, float),
+        }
+        if begun is not None:
+            content |= {f"plan_{name}": value for name, value in begun.plan._asdict().items()}
+            content |= {name: getattr(begun, name) for name in ("states", "controls", "step", "phase")}
+        buffer = io.BytesIO()
+        np.savez(buffer, **content)
+        write_whole(self._path, buffer.getvalue())
+
+    def done(self) -> None:
+        """Nothing needs to be kept any more."""
+        self._path.unlink(missing_ok=True)
+
+    def _take(self, found: dict[str, np.ndarray]) -> None:
+        def of(kind: str, fields: tuple[str, ...]) -> Iterator[np.ndarray]:
+            return (found[f"{kind}_{name}"] for name in fields)
+
+        focal, *rest = of("camera", ("focal", "centre", "turn", "position"))
+        camera = Camera(float(focal), *rest)
+        self.lifted = Lifted(Pose(*of("pose", Pose._fields)), found["proportions"], camera, float(found["error"]))
+        seconds, compiling, candidates, lost = found["spent"].tolist()
+        self.spent = Spent(seconds, compiling, int(candidates), int(lost))
+        if "states" in found:
+            elites, spread, start, key = of("plan", Plan._fields)
+            plan = Plan(elites, spread, np.float32(start), key)
+            self.begun = Begun(found["states"], found["controls"], plan, int(found["step"]), int(found["phase"]))
+
+
+def fingerprint(*parts: Any) -> str:
+    """Of arrays, bytes and anything that is told by its text: the same again only for the same."""
+    digest = hashlib.sha256()
+    for part in parts:
+        raw = (
+            part.tobytes() if isinstance(part, np.ndarray) else part if isinstance(part, bytes) else repr(part).encode()
+        )
+        digest.update(len(raw).to_bytes(8, "little") + raw)
+    return digest.hexdigest()

@@ -1,0 +1,95 @@
+"""A motion found in a film, as one HTML file: the human in 3D, and over it the keypoints as the camera saw them.
+
+A keypoint is drawn on its ray, a little before what was found: from the film's camera, where the page begins, it lies
+where the image has it, and a line says how far off the point is that it belongs to.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from larp_model.files import write_whole
+from larp_model.scene import Scene
+from larp_model.state import SIZE
+from viewer.replay import FRAME, captioned
+from viewer.scene_view import REFERENCE, SceneView
+from viewer.server import close_server, open_server
+from viewer.stage import ground
+
+KEYPOINT = (204, 51, 17)
+LEGEND = "in colour: executed, grey: kinematic start, red: keypoints, and how far off they are"
+
+
+@dataclass(frozen=True, eq=False)
+class Overlay:
+    """What is laid over each other, in the world frame.
+
+    states, start: (T, L, 13) every `scene.dt`, executed and before physics. seen, found: (F, P, 3) [m] at `rate` frames
+    a second, keypoints on their rays, NaN where there are none, and beside them the points that they belong to.
+    camera: where it stands (3,) and a point (3,) it looks at [m]. field_of_view: from top to bottom [rad].
+    """
+
+    scene: Scene
+    states: np.ndarray
+    start: np.ndarray
+    seen: np.ndarray
+    found: np.ndarray
+    rate: float
+    camera: tuple[np.ndarray, np.ndarray]
+    field_of_view: float
+    title: str = ""
+    summary: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        links = len(self.scene.links)
+        for name in ("states", "start"):
+            value = getattr(self, name)
+            if np.ndim(value) != 3 or value.shape[1:] != (links, SIZE) or not np.isfinite(value).all():
+                raise ValueError(f"{name} has shape {np.shape(value)}, but needs finite (T, {links}, {SIZE})")
+        if np.ndim(self.seen) != 3 or np.shape(self.seen) != np.shape(self.found) or np.shape(self.seen)[2] != 3:
+            raise ValueError(f"seen and found have shapes {np.shape(self.seen)} and {np.shape(self.found)}, not one")
+
+    def at(self, row: int) -> np.ndarray:
+        """Keypoints and their points on the human (K, 2, 3) [m] of the frame nearest to a row of the states."""
+        frame = min(round(row * self.scene.dt * self.rate), len(self.seen) - 1)
+        pairs = np.stack([self.seen[frame], self.found[frame]], axis=1)
+        return pairs[np.isfinite(pairs).all(axis=(1, 2))].astype(np.float32)
+
+
+def overlay_page(overlay: Overlay) -> str:
+    """The page's HTML."""
+    server, scene = open_server(port=0), overlay.scene
+    try:
+        with server.atomic():
+            server.scene.set_up_direction("+z")
+            server.scene.configure_environment_map("studio", environment_intensity=0.6)
+            ground(server)
+            human = SceneView(server, scene, "/human")
+            start = SceneView(server, scene, "/start", REFERENCE, opacity=0.25)
+            first = overlay.at(0)
+            points = server.scene.add_point_cloud(
+                "/keypoints", first[:, 0], KEYPOINT, point_size=0.02, point_shape="circle", precision="float32"
+            )
+            apart = server.scene.add_line_segments("/apart", first, KEYPOINT, thickness=0.006)
+        view = server.initial_camera
+        view.fov, (view.position, view.look_at) = overlay.field_of_view, overlay.camera
+        film, stride = server.get_scene_serializer(), max(1, round(FRAME / scene.dt))
+        for row in range(0, min(len(overlay.states), len(overlay.start)), stride):
+            pairs = overlay.at(row)
+            with server.atomic():
+                human.update(overlay.states[row])
+                start.update(overlay.start[row])
+                points.points, apart.points = pairs[:, 0], pairs
+            film.insert_sleep(stride * scene.dt)
+        page = film.as_html()
+    finally:
+        close_server(server)
+    return captioned(page, overlay.title or "Motion from keypoints", [*overlay.summary, LEGEND])
+
+
+def write_overlay(overlay: Overlay, path: str | Path) -> None:
+    """Write the page."""
+    write_whole(path, overlay_page(overlay).encode())
