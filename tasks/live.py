@@ -117,7 +117,6 @@ class Live:
         self.page, self.choices, self.folder, self.seed = page, choices, folder, seed
         self._start, self._finished = start, finished
         self._tasks: dict[str, Task] = {}
-        self._worlds: dict[tuple[Scene, int], Pushed] = {}
         self._fitted: dict[tuple[str, str, str, str, float], Planners] = {}
         self.errors: deque[tuple[float, float]] = deque(maxlen=REMEMBERED)
         self.run: Run | None = None
@@ -135,14 +134,6 @@ class Live:
         if reference not in self._tasks:
             self._tasks[reference] = self.choices.tasks[reference]()
         return self._tasks[reference]
-
-    def _world(self, task: Task) -> Pushed:
-        """The truth to kick in: an engine's model takes megabytes, so there is one a task, not one a kick."""
-        key = task.scene, task.substeps
-        if key not in self._worlds:
-            self._worlds[key] = Pushed(*key)
-        self._worlds[key].waiting.clear()
-        return self._worlds[key]
 
     def planners(self, wishes: Wishes) -> Planners:
         """The planners that are wished for."""
@@ -208,7 +199,7 @@ class Live:
         wishes = self.page.wishes
         if (task := self._ready(wishes)) is None:
             return
-        world, begun = self._world(task), time.monotonic()
+        world, begun = Pushed(task.scene, task.substeps), time.monotonic()
         planners, told = self.planners(wishes), list[Replan]()
         goals = [wishes.target]
 
