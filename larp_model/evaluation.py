@@ -97,7 +97,7 @@ def novelty(simulator: Simulator, states: np.ndarray, controls: np.ndarray) -> f
     """How far a trajectory of states (T + 1, L, 13) under controls (T, J, 3) [rad] is from what was learned.
 
     Root mean square, over steps and features, of what the networks of the bodies see, in standard deviations of their
-    training data, in whose mean it is 1; of the body that is furthest from its own. Contacts are left out: where links
+    training data, over which it is 1; of the body that is furthest from its own. Contacts are left out: where links
     are apart their networks see anything, and are not heard.
     """
     given = (jnp.asarray(each, jnp.float32) for each in (states[:-1], states[1:], controls))
