@@ -214,7 +214,9 @@ def main(
         film.confidence,
         film.rate,
         lens.focal,
-        *map(np.asarray, (lens.centre, lens.turn, lens.position)),
+        lens.centre,
+        lens.turn,
+        lens.position,
     )
     kept = Kept(out / "unfinished.npz", fingerprint(*given, known, dynamics, seed, MANIFEST.read_bytes()))
     if kept.lifted is None:

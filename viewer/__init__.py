@@ -2,7 +2,7 @@
 
 from viewer.app import LivePage, Stopped, show
 from viewer.film import check_film, write_film
-from viewer.overlay import Overlay, overlay_page, write_overlay
+from viewer.overlay import Overlay, write_overlay
 from viewer.picture import kick_picture
 from viewer.recording import Approach, Recording, nearest_approach
 from viewer.replay import framed, page_of, write_html
@@ -23,7 +23,6 @@ __all__ = [
     "framed",
     "kick_picture",
     "nearest_approach",
-    "overlay_page",
     "page_of",
     "show",
     "write_film",

@@ -31,8 +31,6 @@ from viewer.stage import LEGEND, Stage, whole
 from viewer.wishes import Offer, Push, Wishes
 
 FRAME = 1.0 / 25.0  # s
-# A picture waits for so much of its time until whoever plans rests: else it takes them one of few cores.
-POLITE = 1.0
 # Pictures by which drawing may be behind what happens, where that comes in bursts.
 BEHIND = 5
 # So many clients are drawn for at that pace; more share what time there is, for each takes the planner some.
@@ -94,7 +92,6 @@ class LivePage:
         self.offer = offer
         self._lock, self._closed, self._moved = threading.RLock(), threading.Event(), threading.Event()
         self._rests = threading.Event()  # while whoever plans waits for the time to come
-        self._rests.set()
         self._changes = self._frames = 0
         self._asked: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._mode: Mode = "waiting"
@@ -322,7 +319,6 @@ class LivePage:
             self._panel.play(max(each.duration for each in both), recording.scene.dt)
             self._recording, self._beside, self._drawn, self._news = recording, beside, None, None
             self._mode = "replay"
-            self._rests.set()
 
     def tell(self, text: str) -> None:
         """What is going on, in Markdown."""
@@ -367,7 +363,8 @@ class LivePage:
         last = due = clock.monotonic()
         while not self._closed.wait(max(0.0, due - clock.monotonic())):
             pace = FRAME * max(1.0, len(self._views) / AT_FULL_PACE)
-            self._rests.wait(POLITE * pace)
+            if self._mode == "running":
+                self._rests.wait(pace)  # or it would take one of few cores from whoever plans
             now = clock.monotonic()
             due = max(due + pace, now + 0.5 * pace)
             with self._lock:

@@ -40,7 +40,6 @@ class Overlay:
     rate: float
     camera: tuple[np.ndarray, np.ndarray]
     field_of_view: float
-    title: str = ""
     summary: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -64,8 +63,6 @@ def overlay_page(overlay: Overlay) -> str:
     server, scene = open_server(port=0), overlay.scene
     try:
         with server.atomic():
-            server.scene.set_up_direction("+z")
-            server.scene.configure_environment_map("studio", environment_intensity=0.6)
             ground(server)
             human = SceneView(server, scene, "/human")
             start = SceneView(server, scene, "/start", REFERENCE, opacity=0.25)
@@ -87,7 +84,7 @@ def overlay_page(overlay: Overlay) -> str:
         page = film.as_html()
     finally:
         close_server(server)
-    return captioned(page, overlay.title or "Motion from keypoints", [*overlay.summary, LEGEND])
+    return captioned(page, "Motion from keypoints", [*overlay.summary, LEGEND])
 
 
 def write_overlay(overlay: Overlay, path: str | Path) -> None:

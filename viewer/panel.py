@@ -24,7 +24,7 @@ FILES = ("html", "png", "gif")
 # A cost's weight goes up to so many times what it is at first.
 HEAVIEST = 5.0
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#333333")
-LEAST = 1e-3  # a value below has no place on a logarithmic axis, whose labels have three decimals
+LEAST = 1e-6  # a cost below has no place on a logarithmic axis
 ABOUT = """Drag the green target, then **Kick** (key K). The model plans, MuJoCo carries out.
 
 The ball has two handles: where it lies and, above it, how it rolls.

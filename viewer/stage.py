@@ -129,8 +129,6 @@ class Stage:
         self._server, self.scene, self._traced = server, scene, traced
         with server.atomic():
             server.scene.reset()
-            server.scene.set_up_direction("+z")
-            server.scene.configure_environment_map("studio", environment_intensity=0.6)
             _pitch(server)
             self.lane = Lane(server, scene, "/kick", target, traced)
         self.beside: Lane | None = None
@@ -170,7 +168,9 @@ def whole(recording: Recording) -> np.ndarray:
 
 
 def ground(server: viser.ViserServer) -> None:
-    """The ground with a grid of metres."""
+    """The ground with a grid of metres, up and the light."""
+    server.scene.set_up_direction("+z")
+    server.scene.configure_environment_map("studio", environment_intensity=0.6)
     server.scene.add_grid(
         "/ground",
         60.0,

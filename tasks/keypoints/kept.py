@@ -95,11 +95,9 @@ class Kept:
 
 
 def fingerprint(*parts: Any) -> str:
-    """Of arrays, bytes and anything that is told by its text: the same again only for the same."""
+    """Of arrays, bytes, texts and numbers: the same again only for the same."""
     digest = hashlib.sha256()
     for part in parts:
-        raw = (
-            part.tobytes() if isinstance(part, np.ndarray) else part if isinstance(part, bytes) else repr(part).encode()
-        )
+        raw = np.asarray(part).tobytes()
         digest.update(len(raw).to_bytes(8, "little") + raw)
     return digest.hexdigest()

@@ -265,15 +265,19 @@ class _Lifter:
         enough = np.flatnonzero((self.keypoints.confidence > 0.3).sum(axis=1) >= 6)
         return np.unique(np.append(enough[::every], enough[-1]))
 
-    def chosen(self, turns: np.ndarray, begin: np.ndarray, free: np.ndarray, shared: np.ndarray) -> Pose:
-        """A pose in all frames: of what `frames` lead to when solved alone, the sequence that moves least."""
-        turns, changes, costs = self.alone(self.frames, turns, begin, free, shared)
+    def points(self, turns: np.ndarray, changes: np.ndarray, shared: np.ndarray) -> np.ndarray:
+        """Points (F, S, P, 3) [m] of turns (F, S, 3, 3) and changes (F, S, D)."""
         flat = Pose(
             changes[..., :3].reshape(-1, 3),
             turns.reshape(-1, 3, 3),
             changes[..., 6:].reshape(-1, self.figure.joints, 3),
         )
-        points = self.figure.all_points(flat, shared[:SHARED]).reshape(*costs.shape, len(POINTS), 3)
+        return self.figure.all_points(flat, shared[:SHARED]).reshape(*changes.shape[:2], len(POINTS), 3)
+
+    def chosen(self, turns: np.ndarray, begin: np.ndarray, free: np.ndarray, shared: np.ndarray) -> Pose:
+        """A pose in all frames: of what `frames` lead to when solved alone, the sequence that moves least."""
+        turns, changes, costs = self.alone(self.frames, turns, begin, free, shared)
+        points = self.points(turns, changes, shared)
         rows = np.arange(len(self.frames)), self.sequence(self.frames, points, costs)
         return _between(self.frames, changes[rows], turns[rows], len(self.keypoints))
 
@@ -288,13 +292,9 @@ class _Lifter:
             shared = np.zeros(len(self.shared_sigma))
             shared[SHARED] = tilt
             turns, changes, costs = self.alone(frames, *self.begun(frames, shared), self.free, shared)
-            pose = Pose(changes[..., :3], turns, changes[..., 6:].reshape(*costs.shape, -1, 3))
-            flat = Pose(*(each.reshape(-1, *each.shape[2:]) for each in pose))
-            lowest = self.figure.all_points(flat, shared[:SHARED])[:, FEET, 2].min(axis=1).reshape(costs.shape) - SOLE
-            found.append(
-                (float((costs + (lowest / AFLOAT) ** 2).min(axis=1).mean()) + (tilt / TILT) ** 2, tilt, shared)
-            )
-        return min(found, key=lambda each: each[0])[2]
+            afloat = (self.points(turns, changes, shared)[:, :, FEET, 2].min(axis=2) - SOLE) / AFLOAT
+            found.append((float((costs + afloat**2).min(axis=1).mean()) + (tilt / TILT) ** 2, shared))
+        return min(found, key=lambda each: each[0])[1]
 
     @property
     def free(self) -> np.ndarray:
