@@ -30,6 +30,7 @@ from mpc import Dynamics, GaussNewton, MujocoDynamics
 from mpc.loop import Begun, Execution
 from tasks.command import Teller, remember_compilations, run
 from tasks.keypoints import camera as cameras
+from tasks.keypoints import figure as figures
 from tasks.keypoints import formats, lift, physical
 from tasks.keypoints.kept import Kept, Spent, fingerprint
 from tasks.keypoints.picture import pose_picture
@@ -53,7 +54,7 @@ OFTEN = 5.0
 LEAST, ASTRAY = 10, 0.03
 
 
-def simulated(figure: lift.Figure, proportions: np.ndarray, manifest: Path) -> Body:
+def simulated(figure: figures.Figure, proportions: np.ndarray, manifest: Path) -> Body:
     """The human of these proportions, each link as near to them as the weights know."""
     body = figure.of(proportions)
     known = stored.trained_sizes(text.loads(manifest.read_bytes()))[body.kind]
@@ -118,7 +119,7 @@ def reconstruct(
 
     kept: to go on from, and to keep what is done in. at: called after every step, with their number.
     """
-    figure = lift.figure()
+    figure = figures.figure()
     body = simulated(figure, lifted.proportions, MANIFEST)
     scene = Scene((body,), dt=DT)
     model: Dynamics

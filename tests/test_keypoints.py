@@ -15,6 +15,7 @@ from larp_model.bodies import human_and_ball
 from larp_model.scene import Scene
 from larp_model.truth.mujoco import closed
 from tasks.keypoints import camera as cameras
+from tasks.keypoints import figure as figures
 from tasks.keypoints import filmed, lift, metrics, physical
 from tasks.keypoints.banded import Banded
 from tasks.keypoints.figure import SHARED, Figure, Pose
@@ -34,7 +35,7 @@ def random_pose(random: np.random.Generator, figure: Figure, frames: int) -> Pos
 @pytest.fixture(scope="module")
 def kick() -> np.ndarray:
     """Points (T, P, 3) of the embedded kick, 50 frames a second, until after the strike."""
-    reference, figure = embedded(human_and_ball()), lift.figure()
+    reference, figure = embedded(human_and_ball()), figures.figure()
     points = physical.Seen(figure.body, figure, np.zeros(SHARED))
     states = reference.states[: reference.strike + 40 : 2, : len(figure.body.links)]
     return np.asarray(points.points(states.astype(np.float32)), float)
@@ -99,7 +100,7 @@ class TestFigure:
     @settings(max_examples=10)
     @given(seeds)
     def test_bones_are_as_long_in_every_pose(self, seed: int) -> None:
-        figure, random = lift.figure(), np.random.default_rng(seed)
+        figure, random = figures.figure(), np.random.default_rng(seed)
         proportions = 0.1 * random.standard_normal(SHARED)
         points = figure.all_points(random_pose(random, figure, 5), proportions)
         for one, other in (("hip", "knee"), ("knee", "ankle"), ("elbow", "wrist"), ("ankle", "toe")):
@@ -111,7 +112,7 @@ class TestFigure:
     @settings(max_examples=10)
     @given(seeds)
     def test_who_is_larger_as_a_whole_is_larger_in_every_part(self, seed: int) -> None:
-        figure, random = lift.figure(), np.random.default_rng(seed)
+        figure, random = figures.figure(), np.random.default_rng(seed)
         pose = random_pose(random, figure, 3)
         larger = np.zeros(SHARED)
         larger[0] = np.log(1.2)
@@ -119,7 +120,7 @@ class TestFigure:
         np.testing.assert_allclose(large, 1.2 * small, atol=1e-5)
 
     def test_its_points_are_where_the_simulated_human_has_them(self) -> None:
-        figure, random = lift.figure(), np.random.default_rng(3)
+        figure, random = figures.figure(), np.random.default_rng(3)
         pose, proportions = random_pose(random, figure, 4), 0.05 * random.standard_normal(SHARED)
         body = figure.of(proportions)
         states = np.zeros((4, len(body.links), 13))
@@ -200,7 +201,7 @@ class TestFilms:
     def test_a_figure_laid_over_a_kick_is_near_the_true_one(self, kick: np.ndarray) -> None:
         film, lens = film_of(kick, 11)
         lifted = lift.lift(film, lens)
-        found = lift.figure().all_points(lifted.pose, lifted.proportions)
+        found = figures.figure().all_points(lifted.pose, lifted.proportions)
         errors = metrics.position_errors(found, kick)
         assert errors["mpjpe_g_mm"] < 120.0 and errors["mpjpe_pa_mm"] < 60.0
         assert lifted.error < 8.0 and metrics.foot_skate(found) <= 4.0
@@ -208,7 +209,7 @@ class TestFilms:
     def test_a_camera_of_which_only_the_lens_is_known_is_found_with_the_motion(self, kick: np.ndarray) -> None:
         film, lens = film_of(kick, 13)
         lifted = lift.lift(film, cameras.held(lens.focal, filmed.SIZE), known=False)
-        found = lift.figure().all_points(lifted.pose, lifted.proportions)
+        found = figures.figure().all_points(lifted.pose, lifted.proportions)
         errors = metrics.position_errors(found, kick)
         tilt, found_tilt = (float(np.arcsin(-np.asarray(each.turn)[2, 2])) for each in (lens, lifted.camera))
         assert errors["mpjpe_pa_mm"] < 50.0 and lifted.error < 8.0

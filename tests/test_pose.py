@@ -14,6 +14,7 @@ from larp_model.bodies import human_and_ball
 from tasks import pose
 from tasks.benchmarks import pose as benchmark
 from tasks.command import Teller, run
+from tasks.keypoints import figure as figures
 from tasks.keypoints import filmed, lift, metrics, physical
 from tasks.keypoints.figure import SHARED
 from tasks.keypoints.kept import Kept
@@ -25,7 +26,7 @@ from tasks.motions.references import embedded
 @pytest.fixture(scope="module")
 def film() -> dict[str, Any]:
     """Keypoints of the swing and the strike of the embedded kick, its camera, and where its points truly are."""
-    reference, figure = embedded(human_and_ball()), lift.figure()
+    reference, figure = embedded(human_and_ball()), figures.figure()
     points = physical.Seen(figure.body, figure, np.zeros(SHARED))
     states = reference.states[: reference.strike + 20 : 2, : len(figure.body.links)]
     true = np.asarray(points.points(states.astype(np.float32)), float)
@@ -90,7 +91,7 @@ def test_a_reconstruction_that_was_cut_off_goes_on_as_if_it_had_not_been(
 
 def test_what_was_kept_of_another_film_or_is_damaged_is_of_no_use(film: dict[str, Any], tmp_path: Path) -> None:
     path = tmp_path / "unfinished.npz"
-    found = lift.Lifted(lift.Pose(*(np.zeros(2),) * 3), np.zeros(11), film["lens"], 1.0)
+    found = lift.Lifted(figures.Pose(*(np.zeros(2),) * 3), np.zeros(11), film["lens"], 1.0)
     Kept(path, "one").keep(found)
     again = Kept(path, "one")
     assert again.lifted is not None and again.lifted.error == 1.0 and again.begun is None

@@ -15,6 +15,7 @@ from larp_model.bodies import human_and_ball
 from larp_model.names import require_file
 from tasks.benchmarks import report
 from tasks.command import remember_compilations, run
+from tasks.keypoints import figure as figures
 from tasks.keypoints import filmed, lift, metrics, physical
 from tasks.keypoints.figure import SHARED
 from tasks.models import DynamicsName
@@ -48,7 +49,7 @@ def filmed_points(clip: Path | None, seconds: float) -> np.ndarray:
     clip: BVH or npz; the embedded kick, performed in the truth, by default.
     """
     if clip is None:
-        reference, figure = embedded(human_and_ball()), lift.figure()
+        reference, figure = embedded(human_and_ball()), figures.figure()
         states = reference.states[:, : len(figure.body.links)].astype(np.float32)
         points = np.asarray(physical.Seen(figure.body, figure, np.zeros(SHARED)).points(states), float)
         rate, strike = 100.0, reference.strike / 100.0
@@ -87,7 +88,7 @@ def measured(clip: Path | None, camera: int, seconds: float, ways: Sequence[Way]
     names: dict[Way, DynamicsName] = {"larp": "larp", "mujoco": "mujoco"}
     for way in ways:
         if way == "kinematic":
-            row[way] = judged(lift.figure().all_points(lifted.pose, lifted.proportions))
+            row[way] = judged(figures.figure().all_points(lifted.pose, lifted.proportions))
             continue
         made = reconstruct(film, lifted, names[way], seed)
         row[way] = judged(made.found) | {

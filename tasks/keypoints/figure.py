@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
 import jax
@@ -104,6 +105,12 @@ class Figure:
         """Points (T, P, 3) [m] of all frames."""
         given = (jnp.asarray(each, jnp.float32) for each in (*pose, proportions))
         return np.asarray(_all_points(self, *given), float)
+
+
+@cache
+def figure() -> Figure:
+    """The one that films are seen by."""
+    return Figure()
 
 
 _all_points = jax.jit(lambda figure, *given: jax.vmap(figure.points, (0, 0, 0, None))(*given), static_argnums=0)

@@ -32,8 +32,8 @@ from mpc.loop import Begun, Execution, Phase, Window, execute
 from tasks.data import stray
 from tasks.keypoints.camera import Camera
 from tasks.keypoints.figure import Figure, Pose
-from tasks.keypoints.lift import FEET, OUTLIER, PIXELS, SLOW, Lifted
-from tasks.keypoints.points import POINTS, Keypoints
+from tasks.keypoints.lift import OUTLIER, PIXELS, SLOW, Lifted
+from tasks.keypoints.points import FEET, POINTS, Keypoints
 from tasks.motions.references import clearance, leading
 from tasks.presets import usable
 

@@ -10,6 +10,8 @@ SIDES = ("left", "right")
 LIMBS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle", "heel", "toe")
 # What we know of a person, the sides being the person's own; the toe is the tip of the big one.
 POINTS = ("nose", "left_ear", "right_ear", *(f"{side}_{limb}" for limb in LIMBS for side in SIDES))
+# Rows of heels and toes, side by side.
+FEET = [POINTS.index(f"{side}_{end}") for side in SIDES for end in ("heel", "toe")]
 # Frames a second that a recording may have.
 RATES = (5.0, 1000.0)
 

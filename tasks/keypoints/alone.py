@@ -1,0 +1,207 @@
+"""Frames of a film solved alone, and which sequence of what they lead to is taken.
+
+    minimise over x_t     sum_i c_it |project(p_i(x_t, b)) - y_it|^2 / (3 sigma)^2      points lie where they were seen
+                        + |hinge(angles)|^2 + |S^(-1/2) (angles - m)|^2                poses are as people's are
+                        + sum_feet |min(0, h_f)|^2                                     nobody is in the ground
+
+from many headings and poses in every frame; one image leaves open who leans forwards and who backwards, so of what they
+lead to the sequence that moves least is taken (R. Bellman's dynamic programming).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property, partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from scipy.spatial.transform import Rotation, Slerp
+
+from tasks.keypoints.camera import Camera
+from tasks.keypoints.figure import SHARED, SOLE, Pose, figure
+from tasks.keypoints.image import COMMON, TILT, moved, seen_by
+from tasks.keypoints.likely import POSES, usual_poses, within
+from tasks.keypoints.points import FEET, POINTS, Keypoints
+
+# Frames a second and headings from which frames are solved alone, and steps for each.
+SPARSE, HEADINGS, ALONE = 12.0, 12, 12
+# How fast the body may seem to move between them [m/s], and what that counts beside how well it fits.
+PACE, MOVED = 0.9, 5.0
+# Of depth in the ground [m], as a standard deviation.
+SUNK = 0.08
+# Tilts [rad] from which the least costly is taken, the height [m] that a person is above the ground there, and frames
+# tried.
+TILTS, AFLOAT, FEW = (-0.1, 0.0, 0.1, 0.2, 0.3, 0.45), 0.1, 6
+
+
+class _Seen(NamedTuple):
+    """What one frame shows: places (P, 2) [px], weights (P,)."""
+
+    places: Array
+    weights: Array
+
+
+class Alone:
+    """The equations of single frames."""
+
+    def __init__(self, keypoints: Keypoints, camera: Camera, sigma: float) -> None:
+        """sigma: standard deviation of the keypoints [px]."""
+        self.keypoints, self.camera, self.sigma, self.figure = keypoints, camera, sigma, figure()
+        self.starts = usual_poses()[2]
+
+    def solved(
+        self, frames: np.ndarray, turns: np.ndarray, begin: np.ndarray, free: np.ndarray, shared: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What single frames (F,) lead to from turns (F, S, 3, 3) and changes (F, S, D) on, those free (D,) to change.
+
+        Returns turns, changes and costs (F, S).
+        """
+        seen = _Seen(*(np.nan_to_num(each[frames]) for each in (self.keypoints.places, self.keypoints.confidence)))
+        given = jax.tree.map(partial(jnp.asarray, dtype=jnp.float32), (begin, turns, seen, free, shared))
+        changes, costs = map(np.asarray, self.improved(*given))
+        turned = Rotation.from_rotvec(changes[..., 3:6].reshape(-1, 3)).as_matrix().reshape(*costs.shape, 3, 3)
+        return turned @ turns, changes, costs
+
+    @cached_property
+    def improved(self) -> Callable[..., tuple[Array, Array]]:
+        """Compiled: changes (F, S, D) and costs (F, S) after some steps of Levenberg and Marquardt's."""
+
+        def residuals(change: Array, turn: Array, seen: _Seen, shared: Array) -> Array:
+            points, found = moved(self.figure, self.camera, turn, change, shared)
+            image = jnp.sqrt(seen.weights)[:, None] * (found - seen.places) / (3.0 * self.sigma)
+            sunk = jnp.minimum(points[jnp.array(FEET), 2], 0.0) / SUNK
+            return jnp.concatenate([image.ravel(), *within(self.figure, turn, change), sunk])
+
+        def improved(change: Array, turn: Array, seen: _Seen, free: Array, shared: Array) -> tuple[Array, Array]:
+            def step(carry: tuple[Array, Array, Array], _: None) -> tuple[tuple[Array, Array, Array], None]:
+                change, damping, cost = carry
+                found = residuals(change, turn, seen, shared)
+                slopes = jax.jacfwd(residuals)(change, turn, seen, shared) * free
+                normal = slopes.T @ slopes
+                normal = normal + jnp.diag(damping * jnp.diag(normal) + 1e-3 + (free == 0.0))
+                there = change - jnp.linalg.solve(normal, slopes.T @ found)
+                after = jnp.sum(residuals(there, turn, seen, shared) ** 2)
+                better = after < cost
+                return (
+                    jnp.where(better, there, change),
+                    jnp.where(better, 0.4 * damping, 6.0 * damping),
+                    jnp.where(better, after, cost),
+                ), None
+
+            first = (change, jnp.asarray(0.1), jnp.sum(residuals(change, turn, seen, shared) ** 2))
+            (change, _, cost), _ = jax.lax.scan(step, first, None, length=ALONE)
+            return change, cost
+
+        over_starts = jax.vmap(improved, (0, 0, None, None, None))
+        return jax.jit(jax.vmap(over_starts, (0, 0, 0, None, None)))
+
+    def begun(self, frames: np.ndarray, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Turns (F, S, 3, 3) and changes (F, S, D): every heading and usual pose, as far away as the image is small."""
+        camera = seen_by(self.camera, shared)
+        headings = np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False)
+        turns = np.repeat(Rotation.from_rotvec(headings[:, None] * (0.0, 0.0, 1.0)).as_matrix(), POSES, axis=0)
+        angles = np.tile(self.starts, (HEADINGS, 1, 1))
+        pose = Pose(np.zeros((len(turns), 3)), turns, angles)
+        around = self.figure.all_points(pose, np.zeros(SHARED))
+        local = around @ camera.turn.T
+        begin = np.zeros((len(frames), len(turns), 6 + 3 * self.figure.joints))
+        for row, frame in enumerate(frames):
+            seen = self.keypoints.seen[frame]
+            places = self.keypoints.places[frame, seen]
+            spread = np.sqrt(local[:, seen, :2].var(axis=1).sum(axis=-1))
+            depth = np.clip(camera.focal * spread / max(np.sqrt(places.var(axis=0).sum()), 1.0), 1.0, 60.0)
+            ray = camera.ray(places.mean(axis=0))
+            begin[row, :, :3] = camera.position + depth[:, None] * ray - around[:, seen].mean(axis=1)
+        begin[:, :, 6:] = angles.reshape(len(angles), -1)
+        return np.broadcast_to(turns, (len(frames), *turns.shape)), begin
+
+    def sequence(self, frames: np.ndarray, points: np.ndarray, costs: np.ndarray) -> np.ndarray:
+        """Which of S possibilities to take in each of the frames (F,), by points (F, S, P, 3) and costs (F, S)."""
+        best, steps = costs[0], []
+        for row in range(1, len(frames)):
+            far = PACE * (frames[row] - frames[row - 1]) / self.keypoints.rate
+            moved = np.linalg.norm(points[row - 1][:, None] - points[row][None], axis=-1)
+            both = best[:, None] + MOVED * (moved**2).mean(axis=-1) / far**2
+            steps.append(both.argmin(axis=0))
+            best = both.min(axis=0) + costs[row]
+        path = [int(best.argmin())]
+        for step in reversed(steps):
+            path.append(int(step[path[-1]]))
+        return np.array(path[::-1])
+
+    @cached_property
+    def frames(self) -> np.ndarray:
+        """The frames that are solved alone."""
+        every = max(1, round(self.keypoints.rate / SPARSE))
+        enough = np.flatnonzero((self.keypoints.confidence > 0.3).sum(axis=1) >= 6)
+        return np.unique(np.append(enough[::every], enough[-1]))
+
+    def points(self, turns: np.ndarray, changes: np.ndarray, shared: np.ndarray) -> np.ndarray:
+        """Points (F, S, P, 3) [m] of turns (F, S, 3, 3) and changes (F, S, D)."""
+        flat = Pose(
+            changes[..., :3].reshape(-1, 3),
+            turns.reshape(-1, 3, 3),
+            changes[..., 6:].reshape(-1, self.figure.joints, 3),
+        )
+        return self.figure.all_points(flat, shared[:SHARED]).reshape(*changes.shape[:2], len(POINTS), 3)
+
+    def chosen(self, turns: np.ndarray, begin: np.ndarray, free: np.ndarray, shared: np.ndarray) -> Pose:
+        """A pose in all frames: of what `frames` lead to when solved alone, the sequence that moves least."""
+        turns, changes, costs = self.solved(self.frames, turns, begin, free, shared)
+        points = self.points(turns, changes, shared)
+        rows = np.arange(len(self.frames)), self.sequence(self.frames, points, costs)
+        return _between(self.frames, changes[rows], turns[rows], len(self.keypoints))
+
+    def first(self, shared: np.ndarray) -> Pose:
+        """A pose in all frames, from nothing."""
+        return self.chosen(*self.begun(self.frames, shared), self.free, shared)
+
+    def tilted(self) -> np.ndarray:
+        """What is shared at first: the tilt at which some frames, solved alone, show a person on the ground."""
+        frames, found = self.frames[:: max(1, len(self.frames) // FEW)], []
+        for tilt in TILTS:
+            shared = np.zeros(COMMON)
+            shared[SHARED] = tilt
+            turns, changes, costs = self.solved(frames, *self.begun(frames, shared), self.free, shared)
+            afloat = (self.points(turns, changes, shared)[:, :, FEET, 2].min(axis=2) - SOLE) / AFLOAT
+            found.append((float((costs + afloat**2).min(axis=1).mean()) + (tilt / TILT) ** 2, shared))
+        return min(found, key=lambda each: each[0])[1]
+
+    @property
+    def free(self) -> np.ndarray:
+        """Every degree of freedom of a frame (D,)."""
+        return np.ones(6 + 3 * self.figure.joints)
+
+    def rethought(self, pose: Pose, shared: np.ndarray, limb: tuple[int, ...]) -> Pose:
+        """The pose, the joints of one limb in another way where a sequence of such ways fits better."""
+        ways = np.concatenate(
+            [
+                pose.angles[self.frames][:, None, list(limb)],
+                np.broadcast_to(self.starts[:, list(limb)], (len(self.frames), POSES, len(limb), 3)),
+            ],
+            axis=1,
+        )
+        angles = np.repeat(pose.angles[self.frames][:, None], 1 + POSES, axis=1)
+        angles[:, :, list(limb)] = ways
+        begin = np.zeros((*angles.shape[:2], 6 + 3 * self.figure.joints))
+        begin[..., :3], begin[..., 6:] = pose.place[self.frames][:, None], angles.reshape(*angles.shape[:2], -1)
+        turns = np.repeat(pose.turn[self.frames][:, None], 1 + POSES, axis=1)
+        free = np.zeros((6 + 3 * self.figure.joints,))
+        for joint in limb:
+            free[6 + 3 * joint : 9 + 3 * joint] = 1.0
+        found = self.chosen(turns, begin, free, shared)
+        changed = pose.angles.copy()
+        changed[:, list(limb)] = found.angles[:, list(limb)]
+        return pose._replace(angles=changed)
+
+
+def _between(frames: np.ndarray, changes: np.ndarray, turns: np.ndarray, count: int) -> Pose:
+    """The pose in all of so many frames, from some of them."""
+    at = np.clip(np.arange(count), frames[0], frames[-1])
+    mix = lambda values: np.stack([np.interp(at, frames, each) for each in values.T], axis=1)  # noqa: E731
+    turn = Rotation.from_matrix(turns)
+    between = Slerp(frames, turn)(at) if len(frames) > 1 else Rotation.concatenate([turn] * count)
+    return Pose(mix(changes[:, :3]), between.as_matrix(), mix(changes[:, 6:]).reshape(count, -1, 3))
