@@ -95,6 +95,7 @@ ORDER = [
     "tasks.keypoints.formats",
     "tasks.keypoints.camera",
     "tasks.keypoints.filmed",
+    "tasks.keypoints.rows",
     "tasks.keypoints.figure",
     "tasks.keypoints.metrics",
     "tasks.keypoints.banded",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -205,6 +206,19 @@ class TestFilms:
         errors = metrics.position_errors(found, kick)
         assert errors["mpjpe_g_mm"] < 120.0 and errors["mpjpe_pa_mm"] < 60.0
         assert lifted.error < 8.0 and metrics.foot_skate(found) <= 4.0
+
+    def test_another_film_of_another_length_by_another_camera_compiles_nothing(
+        self, kick: np.ndarray, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        said = []
+        for seed, frames in ((3, 12), (4, 55)):
+            film, lens = film_of(kick, seed)
+            caplog.clear()
+            with jax.log_compiles():
+                jax.jit(lambda x: x + 1.0)(1.0)
+                lift.lift(film.cut(0, frames - 1), lens)
+            said.append(sum("Compiling" in each for each in caplog.messages))
+        assert said[1] == 1 <= said[0], "it is only the function above that is compiled anew"
 
     def test_a_camera_of_which_only_the_lens_is_known_is_found_with_the_motion(self, kick: np.ndarray) -> None:
         film, lens = film_of(kick, 13)

@@ -10,9 +10,7 @@ lead to the sequence that moves least is taken (R. Bellman's dynamic programming
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cached_property, partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,10 +19,11 @@ from jax import Array
 from scipy.spatial.transform import Rotation, Slerp
 
 from tasks.keypoints.camera import Camera
-from tasks.keypoints.figure import SHARED, SOLE, Pose, figure
+from tasks.keypoints.figure import SHARED, SOLE, Figure, Pose, figure
 from tasks.keypoints.image import COMMON, TILT, moved, seen_by
 from tasks.keypoints.likely import POSES, usual_poses, within
 from tasks.keypoints.points import FEET, POINTS, Keypoints
+from tasks.keypoints.rows import by_rows, single
 
 # Frames a second and headings from which frames are solved alone, and steps for each.
 SPARSE, HEADINGS, ALONE = 12.0, 12, 12
@@ -35,13 +34,6 @@ SUNK = 0.08
 # Tilts [rad] from which the least costly is taken, the height [m] that a person is above the ground there, and frames
 # tried.
 TILTS, AFLOAT, FEW = (-0.1, 0.0, 0.1, 0.2, 0.3, 0.45), 0.1, 6
-
-
-class _Seen(NamedTuple):
-    """What one frame shows: places (P, 2) [px], weights (P,)."""
-
-    places: Array
-    weights: Array
 
 
 class Alone:
@@ -59,44 +51,14 @@ class Alone:
 
         Returns turns, changes and costs (F, S).
         """
-        seen = _Seen(*(np.nan_to_num(each[frames]) for each in (self.keypoints.places, self.keypoints.confidence)))
-        given = jax.tree.map(partial(jnp.asarray, dtype=jnp.float32), (begin, turns, seen, free, shared))
-        changes, costs = map(np.asarray, self.improved(*given))
+        known = single((self.camera, self.sigma, shared, free))
+        seen = (np.nan_to_num(each[frames]) for each in (self.keypoints.places, self.keypoints.confidence))
+        places, weights = (np.repeat(each, begin.shape[1], axis=0) for each in seen)
+        flat = turns.reshape(-1, 3, 3), places, weights, begin.reshape(len(places), -1)
+        changes, costs = by_rows(lambda *rows: _all_improved(self.figure, *known, *rows), *flat)
+        changes, costs = changes.reshape(begin.shape), costs.reshape(begin.shape[:2])
         turned = Rotation.from_rotvec(changes[..., 3:6].reshape(-1, 3)).as_matrix().reshape(*costs.shape, 3, 3)
         return turned @ turns, changes, costs
-
-    @cached_property
-    def improved(self) -> Callable[..., tuple[Array, Array]]:
-        """Compiled: changes (F, S, D) and costs (F, S) after some steps of Levenberg and Marquardt's."""
-
-        def residuals(change: Array, turn: Array, seen: _Seen, shared: Array) -> Array:
-            points, found = moved(self.figure, self.camera, turn, change, shared)
-            image = jnp.sqrt(seen.weights)[:, None] * (found - seen.places) / (3.0 * self.sigma)
-            sunk = jnp.minimum(points[jnp.array(FEET), 2], 0.0) / SUNK
-            return jnp.concatenate([image.ravel(), *within(self.figure, turn, change), sunk])
-
-        def improved(change: Array, turn: Array, seen: _Seen, free: Array, shared: Array) -> tuple[Array, Array]:
-            def step(carry: tuple[Array, Array, Array], _: None) -> tuple[tuple[Array, Array, Array], None]:
-                change, damping, cost = carry
-                found = residuals(change, turn, seen, shared)
-                slopes = jax.jacfwd(residuals)(change, turn, seen, shared) * free
-                normal = slopes.T @ slopes
-                normal = normal + jnp.diag(damping * jnp.diag(normal) + 1e-3 + (free == 0.0))
-                there = change - jnp.linalg.solve(normal, slopes.T @ found)
-                after = jnp.sum(residuals(there, turn, seen, shared) ** 2)
-                better = after < cost
-                return (
-                    jnp.where(better, there, change),
-                    jnp.where(better, 0.4 * damping, 6.0 * damping),
-                    jnp.where(better, after, cost),
-                ), None
-
-            first = (change, jnp.asarray(0.1), jnp.sum(residuals(change, turn, seen, shared) ** 2))
-            (change, _, cost), _ = jax.lax.scan(step, first, None, length=ALONE)
-            return change, cost
-
-        over_starts = jax.vmap(improved, (0, 0, None, None, None))
-        return jax.jit(jax.vmap(over_starts, (0, 0, 0, None, None)))
 
     def begun(self, frames: np.ndarray, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Turns (F, S, 3, 3) and changes (F, S, D): every heading and usual pose, as far away as the image is small."""
@@ -205,3 +167,42 @@ def _between(frames: np.ndarray, changes: np.ndarray, turns: np.ndarray, count: 
     turn = Rotation.from_matrix(turns)
     between = Slerp(frames, turn)(at) if len(frames) > 1 else Rotation.concatenate([turn] * count)
     return Pose(mix(changes[:, :3]), between.as_matrix(), mix(changes[:, 6:]).reshape(count, -1, 3))
+
+
+def _residuals(
+    body: Figure, camera: Camera, sigma: Array, shared: Array, turn: Array, places: Array, weights: Array, change: Array
+) -> Array:
+    """Of one frame that shows places (P, 2) [px] of weights (P,); see `image.moved`."""
+    points, found = moved(body, camera, turn, change, shared)
+    image = jnp.sqrt(weights)[:, None] * (found - places) / (3.0 * sigma)
+    sunk = jnp.minimum(points[jnp.array(FEET), 2], 0.0) / SUNK
+    return jnp.concatenate([image.ravel(), *within(body, turn, change), sunk])
+
+
+def _improved(
+    body: Figure, camera: Camera, sigma: Array, shared: Array, free: Array,
+    turn: Array, places: Array, weights: Array, change: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """A change (D,) and its cost after some steps of Levenberg and Marquardt's, those free (D,) to change."""
+    residuals = partial(_residuals, body, camera, sigma, shared, turn, places, weights)
+
+    def step(carry: tuple[Array, Array, Array], _: None) -> tuple[tuple[Array, Array, Array], None]:
+        change, damping, cost = carry
+        slopes = jax.jacfwd(residuals)(change) * free
+        normal = slopes.T @ slopes
+        normal = normal + jnp.diag(damping * jnp.diag(normal) + 1e-3 + (free == 0.0))
+        there = change - jnp.linalg.solve(normal, slopes.T @ residuals(change))
+        after = jnp.sum(residuals(there) ** 2)
+        better = after < cost
+        return (
+            jnp.where(better, there, change),
+            jnp.where(better, 0.4 * damping, 6.0 * damping),
+            jnp.where(better, after, cost),
+        ), None
+
+    first = (change, jnp.asarray(0.1), jnp.sum(residuals(change) ** 2))
+    (change, _, cost), _ = jax.lax.scan(step, first, None, length=ALONE)
+    return change, cost
+
+
+_all_improved = jax.jit(jax.vmap(_improved, (*5 * [None], 0, 0, 0, 0)), static_argnums=0)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from larp_model.names import require_file, require_known
@@ -17,6 +18,7 @@ FIELD_OF_VIEW, HELD = 65.0, 1.4
 FIELDS = ("size", "field_of_view", "focal", "centre", "position", "look_at")
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Camera:
     """A pinhole camera without distortion.

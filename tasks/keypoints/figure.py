@@ -14,6 +14,7 @@ from larp_model.bodies import human, segment_of
 from larp_model.rotation import from_rotation_vector, matrix
 from larp_model.scene import Body, Vector
 from tasks.keypoints.points import POINTS, SIDES
+from tasks.keypoints.rows import by_rows, single
 
 # What of a body may differ from the usual: a link's length, or the radius by which the shoulders are apart.
 PROPORTIONS = (
@@ -103,8 +104,8 @@ class Figure:
 
     def all_points(self, pose: Pose, proportions: np.ndarray) -> np.ndarray:
         """Points (T, P, 3) [m] of all frames."""
-        given = (jnp.asarray(each, jnp.float32) for each in (*pose, proportions))
-        return np.asarray(_all_points(self, *given), float)
+        common = single(proportions)
+        return by_rows(lambda *given: _all_points(self, *given, common), *pose)
 
 
 @cache

@@ -19,22 +19,19 @@ matrix is a band with an edge.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from scipy.spatial.transform import Rotation
 
 from tasks.keypoints.alone import Alone
 from tasks.keypoints.banded import Banded
 from tasks.keypoints.camera import Camera
 from tasks.keypoints.figure import SHARED, SOLE, Pose, figure
-from tasks.keypoints.image import HEIGHT, ROLL, TILT, moved, seen_by
+from tasks.keypoints.image import HEIGHT, ROLL, TILT, all_moved, all_slopes, seen_by
 from tasks.keypoints.likely import slopes_of_unlike, unlike
 from tasks.keypoints.points import FEET, POINTS, SIDES, Keypoints
+from tasks.keypoints.rows import by_rows, single
 
 # Standard deviations, in shares: of a detector's points, of the image's larger side; of the body's size.
 PIXELS, GROWN = 0.004, 0.06
@@ -105,9 +102,6 @@ class _Lifter:
         self.alone = Alone(keypoints, camera, self.sigma)
         grown, unknown = (GROWN, (1e-4, 1e-4, 1e-4)) if known else (UNSEEN, (TILT, ROLL, HEIGHT))
         self.shared_sigma = np.array([grown, *VARIED, *unknown, SOLES, SOLES])
-        self.values = jax.jit(jax.vmap(partial(moved, self.figure, camera), (0, 0, None)))
-        both = jax.jacfwd(partial(moved, self.figure, camera), (1, 2))
-        self.slopes = jax.jit(jax.vmap(both, (0, 0, None)))
 
     def solved(self) -> tuple[Pose, np.ndarray]:
         """The pose and what is shared."""
@@ -244,28 +238,26 @@ class _Lifter:
 
     def now(self, pose: Pose, shared: np.ndarray) -> Now:
         """What follows from a pose and what is shared."""
-        points, places = (np.asarray(each, float) for each in self.values(*_arguments(pose, shared)))
+        points, places = self.imaged(all_moved, pose, shared)
         return Now(pose, points, places, points[:, FEET, 2] - SOLE - np.tile(shared[-2:], 2))
 
     def derivatives(self, pose: Pose, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Of points (T, 3 P, D + S) and of their places (T, 2 P, D + S), along changes and what is shared."""
-        found = self.slopes(*_arguments(pose, shared))
-        return tuple(  # type: ignore[return-value]
-            np.concatenate([np.asarray(each, float) for each in both], axis=-1).reshape(len(pose.place), rows, -1)
-            for both, rows in zip(found, (3 * len(POINTS), 2 * len(POINTS)), strict=True)
-        )
+        points, places = self.imaged(all_slopes, pose, shared)
+        frames, _, _, count = points.shape
+        return points.reshape(frames, -1, count), places.reshape(frames, -1, count)
+
+    def imaged(self, function: Callable[..., Any], pose: Pose, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """`image.all_moved` or `image.all_slopes` of all frames."""
+        still = np.zeros_like(pose.place)
+        change = np.concatenate([pose.place, still, pose.angles.reshape(len(pose.place), -1)], axis=1)
+        camera, common = single((self.camera, shared))
+        return by_rows(lambda turn, change: function(self.figure, camera, turn, change, common), pose.turn, change)
 
 
 def second_differences(values: np.ndarray) -> np.ndarray:
     """Second differences (T - 2, ...) along the frames."""
     return values[2:] - 2.0 * values[1:-1] + values[:-2]
-
-
-def _arguments(pose: Pose, shared: np.ndarray) -> tuple[Array, Array, Array]:
-    """Of `image.moved` in all frames: turns, changes and what is shared."""
-    change = np.concatenate([pose.place, np.zeros_like(pose.place), pose.angles.reshape(len(pose.place), -1)], axis=1)
-    turn, moved, common = (jnp.asarray(each, jnp.float32) for each in (pose.turn, change, shared))
-    return turn, moved, common
 
 
 def _after(pose: Pose, change: np.ndarray) -> Pose:
