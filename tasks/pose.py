@@ -50,6 +50,8 @@ MANIFEST = stored.SHIPPED / f"{ANY_HUMAN['lean']}.json"
 BEFORE = 0.2
 # What is done is kept every so many seconds.
 OFTEN = 5.0
+# Heights of people [m] that the weights know.
+HEIGHTS = 1.3, 2.2
 # Frames that are needed, and a median error [shares of the image] beyond which the figure does not fit the person.
 LEAST, ASTRAY = 10, 0.03
 
@@ -175,6 +177,7 @@ def main(
     camera: Path | None = None,
     size: tuple[float, float] | None = None,
     person: int | None = None,
+    height: float | None = None,
     dynamics: DynamicsName = "larp",
     seed: int = 0,
     out: Path = Path("runs/pose"),
@@ -190,6 +193,8 @@ def main(
             is known, position and look_at; a phone's by default, its height and tilt estimated.
         size: width and height of the images (px), where neither file says.
         person: which of several, in order of appearance from 0; the one who is seen best by default.
+        height: of the person (m); where it is not known, it is estimated by a camera whose position is, and taken to be
+            1.75 m by any other.
         dynamics: the planner's model: larp (learned) or mujoco.
         seed: of the planner's random numbers.
         out: folder for summary.json, pose.npz and pose.bvh (each a reference for tasks.kick), pose.png,
@@ -197,6 +202,8 @@ def main(
         quiet: print nothing.
         json: print the summary as JSON, and on stderr what else is told.
     """
+    if height is not None and not HEIGHTS[0] <= height <= HEIGHTS[1]:
+        raise ValueError(f"height is {height:g}, but must be from {HEIGHTS[0]:g} to {HEIGHTS[1]:g} m")
     require_writable(out, "out")
     loaded = formats.load(keypoints, rate, size, person)
     film = cut(loaded.keypoints)
@@ -218,11 +225,13 @@ def main(
         lens.centre,
         lens.turn,
         lens.position,
+        known,
+        height or 0.0,
     )
-    kept = Kept(out / "unfinished.npz", fingerprint(*given, known, dynamics, seed, MANIFEST.read_bytes()))
+    kept = Kept(out / "unfinished.npz", fingerprint(*given, dynamics, seed, MANIFEST.read_bytes()))
     if kept.lifted is None:
         with tell.part(f"laying a figure over {len(film)} frames"):
-            lifted = lift.lift(film, lens, known)
+            lifted = lift.lift(film, lens, known, height)
         kept.keep(lifted)
     else:
         lifted = kept.lifted
@@ -238,7 +247,7 @@ def main(
         "rate": film.rate,
         "people": loaded.people,
         "crossed": loaded.crossed,
-        "height_m": 1.75 * standing_height(made.body) / standing_height(human()),
+        "height_m": float(figures.figure().height(np.asarray(lifted.proportions))),
         "camera_m": np.asarray(lifted.camera.position, float).tolist(),
         "focal_px": float(lifted.camera.focal),
         "kinematic_error_px": lifted.error,

@@ -120,6 +120,13 @@ class TestFigure:
         small, large = (figure.all_points(pose, each) - pose.place[:, None] for each in (np.zeros(SHARED), larger))
         np.testing.assert_allclose(large, 1.2 * small, atol=1e-5)
 
+    def test_its_height_is_that_of_the_human_it_is_of(self) -> None:
+        figure, proportions = figures.figure(), np.zeros(SHARED)
+        proportions[0] = np.log(1.6 / figures.USUAL)
+        assert figure.height(proportions) == pytest.approx(1.6)
+        proportions[1 + figures.PROPORTIONS.index(("shin", 0))] = 0.1
+        assert figure.height(proportions) > 1.62
+
     def test_its_points_are_where_the_simulated_human_has_them(self) -> None:
         figure, random = figures.figure(), np.random.default_rng(3)
         pose, proportions = random_pose(random, figure, 4), 0.05 * random.standard_normal(SHARED)
@@ -206,6 +213,18 @@ class TestFilms:
         errors = metrics.position_errors(found, kick)
         assert errors["mpjpe_g_mm"] < 120.0 and errors["mpjpe_pa_mm"] < 60.0
         assert lifted.error < 8.0 and metrics.foot_skate(found) <= 4.0
+
+    def test_a_person_of_known_height_is_as_large_and_as_far_whatever_the_image(self, kick: np.ndarray) -> None:
+        small = 1.6 / 1.75 * kick
+        film, lens = film_of(small, 17)
+        lifted = lift.lift(film, cameras.held(lens.focal, filmed.SIZE), known=False, height=1.6)
+        found = figures.figure().all_points(lifted.pose, lifted.proportions)
+        far, true = (
+            np.linalg.norm(metrics.pelvis(points)[:, 0] - np.asarray(by.position), axis=1).mean()
+            for points, by in ((found, lifted.camera), (small, lens))
+        )
+        assert figures.figure().height(lifted.proportions) == pytest.approx(1.6, rel=0.01)
+        assert far == pytest.approx(true, rel=0.04)
 
     def test_another_film_of_another_length_by_another_camera_compiles_nothing(
         self, kick: np.ndarray, caplog: pytest.LogCaptureFixture

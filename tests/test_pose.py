@@ -100,6 +100,16 @@ def test_what_was_kept_of_another_film_or_is_damaged_is_of_no_use(film: dict[str
     assert Kept(path, "one").lifted is None
 
 
+@pytest.mark.parametrize("height", pose.HEIGHTS)
+def test_people_of_all_heights_are_simulated_as_large_as_they_are(height: float) -> None:
+    figure, proportions = figures.figure(), np.zeros(SHARED)
+    proportions[0] = np.log(height / figures.USUAL)
+    wanted, made = (
+        body.sizes[:, 0] for body in (figure.of(proportions), pose.simulated(figure, proportions, pose.MANIFEST))
+    )
+    np.testing.assert_allclose(made, wanted, rtol=0.01)
+
+
 def test_frames_at_the_ends_in_which_nobody_is_seen_are_left_out(film: dict[str, Any]) -> None:
     whole = film["keypoints"]
     hidden = Keypoints(whole.places.copy(), whole.confidence.copy(), whole.rate, whole.size)
@@ -117,6 +127,7 @@ def test_frames_at_the_ends_in_which_nobody_is_seen_are_left_out(film: dict[str,
         ({"confidence": np.zeros((30, len(POINTS)))}, [], "film.npz"),
         ({}, ["--camera", "nowhere.json"], "nowhere.json"),
         ({}, ["--person", "4"], "person"),
+        ({}, ["--height", "3"], "height is 3, but must be from 1.3 to 2.2 m"),
     ],
 )
 def test_what_cannot_be_reconstructed_is_refused_in_one_line_and_nothing_is_written(

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from tasks.keypoints.camera import Camera
 from tasks.keypoints.figure import SHARED, SOLE, Figure, Pose, figure
-from tasks.keypoints.image import COMMON, TILT, moved, seen_by
+from tasks.keypoints.image import TILT, moved, seen_by
 from tasks.keypoints.likely import POSES, usual_poses, within
 from tasks.keypoints.points import FEET, POINTS, Keypoints
 from tasks.keypoints.rows import by_rows, single
@@ -67,7 +67,7 @@ class Alone:
         turns = np.repeat(Rotation.from_rotvec(headings[:, None] * (0.0, 0.0, 1.0)).as_matrix(), POSES, axis=0)
         angles = np.tile(self.starts, (HEADINGS, 1, 1))
         pose = Pose(np.zeros((len(turns), 3)), turns, angles)
-        around = self.figure.all_points(pose, np.zeros(SHARED))
+        around = self.figure.all_points(pose, shared[:SHARED])
         local = around @ camera.turn.T
         begin = np.zeros((len(frames), len(turns), 6 + 3 * self.figure.joints))
         for row, frame in enumerate(frames):
@@ -121,11 +121,11 @@ class Alone:
         """A pose in all frames, from nothing."""
         return self.chosen(*self.begun(self.frames, shared), self.free, shared)
 
-    def tilted(self) -> np.ndarray:
-        """What is shared at first: the tilt at which some frames, solved alone, show a person on the ground."""
+    def tilted(self, usual: np.ndarray) -> np.ndarray:
+        """What is usually shared, but for the tilt at which some frames, solved alone, show a person on the ground."""
         frames, found = self.frames[:: max(1, len(self.frames) // FEW)], []
         for tilt in TILTS:
-            shared = np.zeros(COMMON)
+            shared = usual.copy()
             shared[SHARED] = tilt
             turns, changes, costs = self.solved(frames, *self.begun(frames, shared), self.free, shared)
             afloat = (self.points(turns, changes, shared)[:, :, FEET, 2].min(axis=2) - SOLE) / AFLOAT

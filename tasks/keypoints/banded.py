@@ -35,9 +35,9 @@ class Banded:
                     self.corner += common.T
 
     def share(self, weights: np.ndarray, values: np.ndarray) -> None:
-        """What is shared, its values (S,), as residuals of weights (S,)."""
-        self.corner += np.diag(weights)
-        self.slope[1][:] += weights * values
+        """What is shared, its values (S,), as residuals of weights (S, S)."""
+        self.corner += weights
+        self.slope[1][:] += weights @ values
 
     def solved(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
         """The step (F, D), (S,) down the slope, its matrix's diagonal larger by a share."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
@@ -13,7 +13,7 @@ from jax import Array
 from larp_model.bodies import human, segment_of
 from larp_model.rotation import from_rotation_vector, matrix
 from larp_model.scene import Body, Vector
-from tasks.keypoints.points import POINTS, SIDES
+from tasks.keypoints.points import FEET, POINTS, SIDES
 from tasks.keypoints.rows import by_rows, single
 
 # What of a body may differ from the usual: a link's length, or the radius by which the shoulders are apart.
@@ -32,6 +32,8 @@ ON_LIMBS: dict[str, tuple[str, Vector]] = {
 }
 ON_HEAD: dict[str, Vector] = {"nose": (1.0, 0.0, 0.0), "left_ear": (0.0, 0.8, 0.2), "right_ear": (0.0, -0.8, 0.2)}
 SHARED = 1 + len(PROPORTIONS) + 1
+# Height of the usual human [m].
+USUAL = 1.75
 # How high heel and toe are where the foot stands [m].
 SOLE = 0.017
 
@@ -47,12 +49,12 @@ class Pose(NamedTuple):
 class Figure:
     """A human whose points follow from its pose and proportions.
 
-    Proportions (11,) are logarithms: of the whole, as a share of a human of 1.75 m, and of each of `PROPORTIONS` beside
+    Proportions (11,) are logarithms: of the whole, as a share of the usual human, and of each of `PROPORTIONS` beside
     that. The last is by how much the shoulders are seen ahead of the trunk, in lengths of the torso.
     """
 
     def __init__(self) -> None:
-        self.body = human()
+        self.body = human(height=USUAL)
         self.sizes = self.body.sizes
         names = [link.name for link in self.body.links]
         self.anchors = {name: (names.index("head"), at) for name, at in ON_HEAD.items()}
@@ -82,6 +84,16 @@ class Figure:
         sizes[:, :2] = np.asarray(self.scaled(jnp.asarray(proportions)), float)
         sizes[:, 2] *= np.exp(3.0 * float(proportions[0]))
         return self.body.sized(sizes)
+
+    @partial(jax.jit, static_argnums=0)
+    def height(self, proportions: Array) -> Array:
+        """Of who stands upright [m], in proportion to how high the nose is above the heels."""
+
+        def reach(proportions: Array) -> Array:
+            points = self.points(jnp.zeros(3), jnp.eye(3), jnp.zeros((self.joints, 3)), proportions)
+            return points[POINTS.index("nose"), 2] - points[FEET[0], 2]
+
+        return USUAL * reach(proportions) / reach(jnp.zeros(SHARED))
 
     def points(self, place: Array, turn: Array, angles: Array, proportions: Array) -> Array:
         """Points (P, 3) [m] of one pose: pelvis (3,) [m], its turn (3, 3), joint angles (J, 3) [rad]."""

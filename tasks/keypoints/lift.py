@@ -7,7 +7,7 @@
              + sum_i sqrt(1 + |p_i'' / s_i|^2)                            nothing jerks
              + sum_feet a_ft |p_f'|^2 + a_ft h_f^2 + |min(0, h_f)|^2      feet that stand do so on the ground, and stay
              + a_t |c - p - c'' z / g|^2                                  whom no foot holds up falls over
-        + |b / sigma_b|^2
+        + |(b - b_usual) / sigma_b|^2
 
 rho is Geman and McClure's, m and S are those of the project's own motions, a_ft says how much a foot looks as if it
 stood (both by iteratively reweighted least squares); c is the middle of the mass and p of the feet that stand.
@@ -21,14 +21,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tasks.keypoints.alone import Alone
 from tasks.keypoints.banded import Banded
 from tasks.keypoints.camera import Camera
-from tasks.keypoints.figure import SHARED, SOLE, Pose, figure
-from tasks.keypoints.image import HEIGHT, ROLL, TILT, all_moved, all_slopes, seen_by
+from tasks.keypoints.figure import SHARED, SOLE, USUAL, Pose, figure
+from tasks.keypoints.image import COMMON, HEIGHT, ROLL, TILT, all_moved, all_slopes, seen_by
 from tasks.keypoints.likely import slopes_of_unlike, unlike
 from tasks.keypoints.points import FEET, POINTS, SIDES, Keypoints
 from tasks.keypoints.rows import by_rows, single
@@ -47,7 +49,8 @@ STILL, LEVEL, SUNK, SLOW, LOW = 0.10, 0.015, 0.005, 0.8, 0.08
 # Residuals beyond so many standard deviations count less and less.
 OUTLIER = 6.0
 STEPS = 40
-# Of the body's size where it is not known how high a camera stands: no image tells it, and what is small jerks least.
+# Of the body's height where it is known, or of its size where it is not known how high a camera stands: no image tells
+# it then, and what is small jerks least.
 UNSEEN = 0.005
 # Of where the weight is borne, beside the feet that stand [m]; the mass that is nearest to each point, as a share.
 BORNE = 0.08
@@ -95,17 +98,24 @@ class Term(NamedTuple):
 class _Lifter:
     """The equations of one film."""
 
-    def __init__(self, keypoints: Keypoints, camera: Camera, known: bool) -> None:
+    def __init__(self, keypoints: Keypoints, camera: Camera, known: bool, height: float | None) -> None:
         self.keypoints, self.camera, self.known, self.figure = keypoints, camera, known, figure()
         size = keypoints.size or tuple(2.0 * camera.centre)
         self.sigma = PIXELS * max(size)
         self.alone = Alone(keypoints, camera, self.sigma)
-        grown, unknown = (GROWN, (1e-4, 1e-4, 1e-4)) if known else (UNSEEN, (TILT, ROLL, HEIGHT))
-        self.shared_sigma = np.array([grown, *VARIED, *unknown, SOLES, SOLES])
+        unknown = (1e-4, 1e-4, 1e-4) if known else (TILT, ROLL, HEIGHT)
+        grown = GROWN if known or height is not None else UNSEEN
+        seconds, sigma = len(keypoints) / keypoints.rate, np.array([grown, *VARIED, *unknown, SOLES, SOLES])
+        self.usual, self.prior = np.zeros(COMMON), seconds * np.diag(1.0 / sigma**2)
+        if height is not None:  # which all proportions together have
+            along = np.zeros(COMMON)
+            along[:SHARED] = jax.grad(self.figure.height)(jnp.zeros(SHARED)) / USUAL
+            self.usual[0] = np.log(height / USUAL)
+            self.prior += seconds * np.outer(along, along) / UNSEEN**2
 
     def solved(self) -> tuple[Pose, np.ndarray]:
         """The pose and what is shared."""
-        begin = np.zeros(len(self.shared_sigma)) if self.known else self.alone.tilted()
+        begin = self.usual if self.known else self.alone.tilted(self.usual)
         pose, shared = self.together(self.alone.first(begin), begin, STEPS // 2)
         names = [self.figure.body.links[child].name for child, _, _ in self.figure.body.motors]
         for side in SIDES:
@@ -116,7 +126,6 @@ class _Lifter:
     def together(self, pose: Pose, shared: np.ndarray, steps: int) -> tuple[Pose, np.ndarray]:
         """The pose and what is shared, after so many steps at most."""
         places, confidence = self.keypoints.places, self.keypoints.confidence
-        known = len(pose.place) / self.keypoints.rate / self.shared_sigma**2
         for again in range(3):
             damping = 1e-2
             if again:
@@ -126,12 +135,14 @@ class _Lifter:
                 normal = Banded(len(pose.place), 6 + 3 * self.figure.joints, len(shared))
 
                 def cost(now: Now, shared: np.ndarray, terms: list[Term] = terms) -> float:
-                    return sum(float(np.sum(w * of(now) ** 2)) for w, of, _ in terms) + float(known @ shared**2)
+                    unusual = shared - self.usual
+                    fit = sum(float(np.sum(weights * of(now) ** 2)) for weights, of, _ in terms)
+                    return fit + float(unusual @ self.prior @ unusual)
 
                 here = self.now(pose, shared)
                 for weights, residual, slopes in terms:
                     normal.add(weights, residual(here), slopes)
-                normal.share(known, shared)
+                normal.share(self.prior, shared - self.usual)
                 for _ in range(8):
                     change, common = normal.solved(damping)
                     there = _after(pose, change)
@@ -266,12 +277,13 @@ def _after(pose: Pose, change: np.ndarray) -> Pose:
     return Pose(pose.place + change[:, :3], turn, pose.angles + change[:, 6:].reshape(pose.angles.shape))
 
 
-def lift(keypoints: Keypoints, camera: Camera, known: bool = True) -> Lifted:
+def lift(keypoints: Keypoints, camera: Camera, known: bool = True, height: float | None = None) -> Lifted:
     """The figure in all frames, of which the first and the last show most of a person.
 
     known: whether it is known where the camera stands; else its tilt and height are estimated, from the given ones on.
+    height: of the person [m], where it is known.
     """
-    lifter = _Lifter(keypoints, camera, known)
+    lifter = _Lifter(keypoints, camera, known, height)
     pose, shared = lifter.solved()
     apart = np.linalg.norm(lifter.now(pose, shared).places - keypoints.places, axis=-1)
     found = camera if known else seen_by(camera, shared)
