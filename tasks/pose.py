@@ -63,12 +63,17 @@ def simulated(figure: figures.Figure, proportions: np.ndarray, manifest: Path) -
     return body.sized(np.clip(body.sizes, *known))
 
 
+def shown(keypoints: Keypoints) -> tuple[int, int]:
+    """The first frame in which a person is seen, and the last; refuses what shows too little."""
+    frames = np.flatnonzero((keypoints.confidence > 0.3).sum(axis=1) >= 6)
+    if len(frames) < LEAST:
+        raise ValueError(f"keypoints show 6 or more points in {len(frames)} frames, but need {LEAST} such frames")
+    return int(frames[0]), int(frames[-1])
+
+
 def cut(keypoints: Keypoints) -> Keypoints:
-    """The frames from the first in which a person is seen to the last; refuses what shows too little."""
-    shown = np.flatnonzero((keypoints.confidence > 0.3).sum(axis=1) >= 6)
-    if len(shown) < LEAST:
-        raise ValueError(f"keypoints show 6 or more points in {len(shown)} frames, but need {LEAST} such frames")
-    return keypoints.cut(int(shown[0]), int(shown[-1]))
+    """The frames from the first in which a person is seen to the last."""
+    return keypoints.cut(*shown(keypoints))
 
 
 def angles_of(states: np.ndarray, body: Body, dt: float) -> dict[str, Any]:

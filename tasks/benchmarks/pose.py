@@ -1,11 +1,12 @@
-"""Motion from keypoints against the motion that was filmed: captured clips, seen by synthetic cameras."""
+"""Motion from keypoints against the motion that was filmed: captured clips, seen by synthetic cameras, or AIST++."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -15,13 +16,16 @@ from larp_model.bodies import human_and_ball
 from larp_model.names import require_file
 from tasks.benchmarks import report
 from tasks.command import remember_compilations, run
+from tasks.keypoints import aist as dances
 from tasks.keypoints import figure as figures
 from tasks.keypoints import filmed, lift, metrics, physical
+from tasks.keypoints.camera import Camera
 from tasks.keypoints.figure import SHARED
+from tasks.keypoints.points import Keypoints
 from tasks.models import DynamicsName
 from tasks.motions import skeleton
 from tasks.motions.references import embedded, motion_of
-from tasks.pose import reconstruct
+from tasks.pose import reconstruct, shown
 
 # Frames a second of a film, and of it what lies before a kick's strike, as a share.
 RATE, BEFORE = 60.0, 0.63
@@ -41,6 +45,35 @@ TOLD = {
     "plan_seconds": ("planning", "s a film"),
     "ms_per_candidate": ("planning", "ms a candidate"),
 }
+# The paper's own figures of AIST's videos, in the order of `TOLD`: DiffPhy's (E. Gartner et al. 2022), and what their
+# trajectory optimisation reaches in Bullet and in LARP.
+PAPER = {
+    "easy: DiffPhy": (150.0, 106.0, 66.0, 12.0, None, 19.6),
+    "easy: Bullet": (154.0, 113.0, 69.0, 13.0, 0.41, 4.0),
+    "easy: LARP": (150.0, 113.0, 70.0, 13.0, 0.37, 5.0),
+    "hard: Bullet": (654.0, 437.0, 83.0, 16.0, 0.17, 8.5),
+    "hard: LARP": (643.0, 442.0, 73.0, 14.0, 0.13, 7.2),
+}
+# 15 videos on which others compare themselves with the same works, so the paper's easy ones in all likelihood: it names
+# neither these nor the hard ones.
+EASY = (
+    "gBR_sBM_c06_d06_mBR4_ch06", "gBR_sBM_c07_d06_mBR4_ch02", "gBR_sBM_c08_d05_mBR1_ch01", "gBR_sFM_c03_d04_mBR0_ch01",
+    "gJB_sBM_c02_d09_mJB3_ch10", "gKR_sBM_c09_d30_mKR5_ch05", "gLH_sBM_c04_d18_mLH5_ch07", "gLH_sBM_c07_d18_mLH4_ch03",
+    "gLH_sBM_c09_d17_mLH1_ch02", "gLH_sFM_c03_d18_mLH0_ch15", "gLO_sBM_c05_d14_mLO4_ch07", "gLO_sBM_c07_d15_mLO4_ch09",
+    "gLO_sFM_c02_d15_mLO4_ch21", "gMH_sBM_c01_d24_mMH3_ch02", "gMH_sBM_c05_d24_mMH4_ch07",
+)  # fmt: skip
+
+
+class Film(NamedTuple):
+    """What is reconstructed, and what it is judged by.
+
+    clip: its name. lens: the camera, which is known. true: points (T, P, 3) [m], NaN where they are not known.
+    """
+
+    clip: str
+    keypoints: Keypoints
+    lens: Camera
+    true: np.ndarray
 
 
 def filmed_points(clip: Path | None, seconds: float) -> np.ndarray:
@@ -64,13 +97,52 @@ def filmed_points(clip: Path | None, seconds: float) -> np.ndarray:
     return points[first : first + count]
 
 
-def measured(clip: Path | None, camera: int, seconds: float, ways: Sequence[Way], seed: int) -> dict[str, Any]:
-    """One film, reconstructed in each way."""
+def of_clip(clip: Path | None, camera: int, seconds: float, seed: int) -> Film:
+    """So many seconds of a clip, seen by a synthetic camera and detector."""
     true = filmed_points(clip, seconds)
     random = np.random.default_rng((seed, camera))
     lens = filmed.camera_around(random, true)
-    film = filmed.seen(random, lens, true, RATE)
-    lifted = lift.lift(film, lens)
+    name = "embedded" if clip is None else clip.stem
+    return Film(name, filmed.seen(random, lens, true, RATE), lens, true)
+
+
+def of_dance(folder: Path, sequence: str, camera: int, seconds: float) -> Film:
+    """The first seconds of a dance of AIST++, seen by one of its cameras."""
+    name = dances.video(sequence, camera)
+    keypoints, lens, true = dances.load(folder, sequence, camera)
+    begun = keypoints.cut(0, round(seconds * RATE) - 1)
+    try:
+        first, last = shown(begun)
+    except ValueError as error:
+        raise ValueError(f"sequences has {name!r}, whose {error}") from None
+    true = true[first : last + 1]
+    if np.isnan(metrics.pelvis(true)).any(axis=(1, 2)).all():
+        raise ValueError(f"sequences has {name!r}, of which no frame has both hips")
+    return Film(name, begun.cut(first, last), lens, true)
+
+
+def dances_of(folder: Path, names: Sequence[str], cameras: int, seconds: float) -> dict[str, Callable[[], Film]]:
+    """Films of AIST++ by the names of their videos: those named, and of sequences named the first cameras.
+
+    Refuses what is missing or damaged in any of them.
+    """
+    there = sorted(dances.sequences(folder).keys() & {path.stem for path in (folder / "keypoints2d").glob("*.pkl")})
+    names = names or [video for video in EASY if dances.seen_by(video)[0] in there] or there
+    if not names:
+        raise ValueError(f"aist is {str(folder)!r}, but keypoints2d in it has no sequence that mapping.txt has")
+    films: dict[str, Callable[[], Film]] = {}
+    for sequence, only in map(dances.seen_by, names):
+        for camera in range(cameras) if only is None else (only,):
+            film = partial(of_dance, folder, sequence, camera, seconds)
+            film()
+            films[dances.video(sequence, camera)] = film
+    return films
+
+
+def measured(film: Callable[[], Film], ways: Sequence[Way], seed: int) -> dict[str, Any]:
+    """One film, reconstructed in each way."""
+    name, keypoints, lens, true = film()
+    lifted = lift.lift(keypoints, lens)
 
     def judged(points: np.ndarray) -> dict[str, float]:
         return metrics.position_errors(points, true) | metrics.off_the_ground(points) | {
@@ -80,17 +152,18 @@ def measured(clip: Path | None, camera: int, seconds: float, ways: Sequence[Way]
         }  # fmt: skip
 
     row: dict[str, Any] = {
-        "clip": "embedded" if clip is None else clip.stem,
+        "clip": name,
         "camera_m": lens.position.tolist(),
-        "frames": len(film),
-        "true_foot_skate": metrics.foot_skate(true),
+        "frames": len(keypoints),
     }
+    if not math.isnan(skate := metrics.foot_skate(true)):
+        row["true_foot_skate"] = skate
     names: dict[Way, DynamicsName] = {"larp": "larp", "mujoco": "mujoco"}
     for way in ways:
         if way == "kinematic":
             row[way] = judged(figures.figure().all_points(lifted.pose, lifted.proportions))
             continue
-        made = reconstruct(film, lifted, names[way], seed)
+        made = reconstruct(keypoints, lifted, names[way], seed)
         row[way] = judged(made.found) | {
             "fell": 100.0 * made.fell,
             "plan_seconds": made.spent.seconds,
@@ -121,6 +194,8 @@ def picture(rows: list[dict[str, Any]], ways: Sequence[Way]) -> Figure:
 
 def main(
     clips: tuple[Path, ...] = (),
+    aist: Path | None = None,
+    sequences: tuple[str, ...] = (),
     cameras: int = 2,
     seconds: float = 2.5,
     ways: tuple[Way, ...] = WAYS,
@@ -128,12 +203,15 @@ def main(
     json: Path = Path("runs/benchmarks/pose.json"),
     publish: bool = False,
 ) -> None:
-    """Reconstruct motion from the keypoints of synthetic films, and compare it with what was filmed.
+    """Reconstruct motion from the keypoints of films, and compare it with what was filmed.
 
     Args:
-        clips: captured motions (BVH or npz); the embedded kick by default.
-        cameras: that see each of them, somewhere around it.
-        seconds: of each film, at 60 frames a second.
+        clips: captured motions (BVH or npz), seen by synthetic cameras; the embedded kick by default.
+        aist: folder of AIST++'s annotations, whose dances are taken instead; the paper's figures are put beside.
+        sequences: of aist, by its names (gBR_sBM_cAll_d06_mBR4_ch06) or those of videos (gBR_sBM_c06_d06_mBR4_ch06,
+            camera 6 alone); 15 videos that others take by default, as far as the folder has them, else all that it has.
+        cameras: that see each of them, somewhere around it; of aist, the first.
+        seconds: of each film, at 60 frames a second; of aist, the first.
         ways: the kinematic start alone, or followed by a planner whose model is larp or mujoco.
         seed: of cameras, detector and planner.
         json: where the figures go; the picture goes beside them.
@@ -141,39 +219,53 @@ def main(
     """
     if cameras < 1:
         raise ValueError(f"cameras is {cameras}, but must be at least 1")
+    if aist is not None and cameras > dances.CAMERAS:
+        raise ValueError(f"cameras is {cameras}, but AIST++ has {dances.CAMERAS}")
     if not 0.4 <= seconds <= 60.0:
         raise ValueError(f"seconds is {seconds:g}, but must be from 0.4 to 60")
     if not ways or len(set(ways)) != len(ways):
         raise ValueError(f"ways are {', '.join(ways) or 'none'}, but must be some of {', '.join(WAYS)}, each once")
+    if clips and aist is not None:
+        raise ValueError("clips and aist are both set, but films are made of one of them")
+    if sequences and aist is None:
+        raise ValueError(f"sequences has {sequences[0]!r}, but aist, the folder they are in, is not set")
     for clip in clips:
         require_file("clips", clip)
-    report.ready(json, publish)
-    remember_compilations()
-    named = f" --clips {' '.join(clip.name for clip in clips)}" if clips else ""
-    chosen = "" if ways == WAYS else f" --ways {' '.join(ways)}"
-    command = f"python -m tasks.benchmarks.pose{named} --cameras {cameras} --seconds {seconds:g}{chosen} --seed {seed}"
-    jobs = {
-        f"{'embedded' if clip is None else clip.stem}, camera {camera}": partial(
-            measured, clip, camera, seconds, ways, seed
-        )
+    films: dict[str, Callable[[], Film]] = {
+        f"{'embedded' if clip is None else clip.stem}, camera {camera}": partial(of_clip, clip, camera, seconds, seed)
         for clip in (clips or (None,))
         for camera in range(cameras)
     }
+    if aist is not None:
+        films = dances_of(aist, sequences, cameras, seconds)
+    report.ready(json, publish)
+    remember_compilations()
+    named = f" --clips {' '.join(clip.name for clip in clips)}" if clips else ""
+    if aist is not None:
+        named = f" --aist {aist.name}" + (f" --sequences {' '.join(sequences)}" if sequences else "")
+    chosen = "" if ways == WAYS else f" --ways {' '.join(ways)}"
+    command = f"python -m tasks.benchmarks.pose{named} --cameras {cameras} --seconds {seconds:g}{chosen} --seed {seed}"
+    jobs = {name: partial(measured, film, ways, seed) for name, film in films.items()}
     rows = report.collect(json, command, jobs)
     found = {way: means(rows, way) for way in ways}
     content = {"command": command, "hardware": report.hardware(), "means": found, "rows": rows}
     report.write_json(json, content)
     report.write_picture(json.with_suffix(".png"), picture(rows, ways))
-    table = Table("measure", *ways, title=f"Motion from keypoints, {len(rows)} films")
+    beside = {} if aist is None else {who: dict(zip(TOLD, each, strict=False)) for who, each in PAPER.items()}
+    title = f"Motion from keypoints, {len(rows)} films"
+    if beside:
+        title += " of AIST++, beside the paper's figures, of videos that it does not name"
+    table = Table("measure", *ways, *beside, title=title)
     for name, (measure, unit) in TOLD.items():
         values = [f"{found[way][name]:.3g} {unit}" if name in found[way] else "" for way in ways]
+        theirs = [figures.get(name) for figures in beside.values()]
         if any(values):
-            table.add_row(measure, *values)
-    skate = float(np.mean([row["true_foot_skate"] for row in rows]))
-    table.add_row("foot skate of what was filmed", f"{skate:.3g} %", *[""] * (len(ways) - 1))
+            table.add_row(measure, *values, *("" if each is None else f"{each:g}" for each in theirs))
+    if skates := [row["true_foot_skate"] for row in rows if "true_foot_skate" in row]:
+        table.add_row("foot skate of what was filmed", f"{np.mean(skates):.3g} %")
     report.show(table)
     if publish:
-        report.publish("pose", f"Motion from keypoints, {len(rows)} films", command, table)
+        report.publish("pose" if aist is None else "pose-aist", title, command, table)
 
 
 if __name__ == "__main__":

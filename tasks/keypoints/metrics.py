@@ -1,4 +1,8 @@
-"""How far a reconstructed motion is from the true one, and how plausible it is: the paper's figures, and ours."""
+"""How far a reconstructed motion is from the true one, and how plausible it is: the paper's figures, and ours.
+
+True points that are not known are NaN. Means are over the others, and over frames whose pelvis is known where it is
+what a pose is aligned by.
+"""
 
 from __future__ import annotations
 
@@ -25,24 +29,31 @@ def pelvis(points: np.ndarray) -> np.ndarray:
 def position_errors(found: np.ndarray, true: np.ndarray) -> dict[str, float]:
     """Mean joint errors [mm] of points (T, P, 3) [m]: `mpjpe_g_mm`, `mpjpe_mm` and `mpjpe_pa_mm`.
 
-    Aligned by the pelvis of the first frame, by that of each frame, and by each frame's best turn, shift and scale
-    (Procrustes).
+    Aligned by the pelvis of the first frame in which it is known, by that of each frame, and by each frame's best turn,
+    shift and scale (Procrustes).
     """
 
     def mean(one: np.ndarray, other: np.ndarray) -> float:
-        return 1e3 * float(np.linalg.norm(one[:, JOINTS] - other[:, JOINTS], axis=-1).mean())
+        return 1e3 * float(np.nanmean(np.linalg.norm(one[:, JOINTS] - other[:, JOINTS], axis=-1)))
 
     aligned = np.stack([procrustes(each, wanted) for each, wanted in zip(found, true, strict=True)])
+    first = int(np.argmax(np.isfinite(pelvis(true)).all(axis=(1, 2))))
     return {
-        "mpjpe_g_mm": mean(found - pelvis(found[0]), true - pelvis(true[0])),
+        "mpjpe_g_mm": mean(found - pelvis(found[first]), true - pelvis(true[first])),
         "mpjpe_mm": mean(found - pelvis(found), true - pelvis(true)),
         "mpjpe_pa_mm": mean(aligned, true),
     }
 
 
 def procrustes(found: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """Points (P, 3) turned, shifted and scaled so that their joints come as near to the true ones as they can."""
-    own, other = found[JOINTS], true[JOINTS]
+    """Points (P, 3) turned, shifted and scaled so that their joints come as near to the true ones as they can.
+
+    NaN where fewer than three of these are known.
+    """
+    known = [row for row in JOINTS if np.isfinite(true[row]).all()]
+    if len(known) < 3:
+        return np.full_like(found, np.nan)
+    own, other = found[known], true[known]
     middle, wanted = own.mean(axis=0), other.mean(axis=0)
     turn, _ = Rotation.align_vectors(other - wanted, own - middle)
     turned = turn.apply(own - middle)
@@ -54,11 +65,16 @@ def velocity_error(found: np.ndarray, true: np.ndarray, rate: float) -> float:
     """Mean error [m/s] of the joints' velocities of points (T, P, 3) [m], aligned by the pelvis of each frame."""
     both = ((each - pelvis(each))[:, JOINTS] for each in (found, true))
     one, other = (rate * np.diff(each, axis=0) for each in both)
-    return float(np.linalg.norm(one - other, axis=-1).mean())
+    return float(np.nanmean(np.linalg.norm(one - other, axis=-1)))
 
 
 def foot_skate(points: np.ndarray) -> float:
-    """Share of frames [%] in which a foot in contact moves by more than 2 cm to the next; points (T, P, 3) [m]."""
+    """Share of frames [%] in which a foot in contact moves by more than 2 cm to the next; points (T, P, 3) [m].
+
+    NaN where heels or toes are not known.
+    """
+    if not all(np.isfinite(points[:, rows]).all() for rows in FEET.values()):
+        return np.nan
     skating = np.zeros(len(points) - 1, bool)
     for rows in FEET.values():
         low: np.ndarray = np.all(points[:, rows, 2] < CONTACT, axis=1)
@@ -69,7 +85,7 @@ def foot_skate(points: np.ndarray) -> float:
 
 def pixel_error(places: np.ndarray, true: np.ndarray) -> float:
     """Mean distance [px] of places (T, P, 2) of joints."""
-    return float(np.linalg.norm(places[:, JOINTS] - true[:, JOINTS], axis=-1).mean())
+    return float(np.nanmean(np.linalg.norm(places[:, JOINTS] - true[:, JOINTS], axis=-1)))
 
 
 def off_the_ground(points: np.ndarray) -> dict[str, float]:

@@ -1,0 +1,175 @@
+"""AIST++: people who dance before nine cameras, from its annotations (CC BY 4.0), in our frame.
+
+Of the folder that is distributed, keypoints2d/, keypoints3d/, cameras/ and ignore_list.txt are read. Points are what a
+detector found in each camera's images, and what these nine together say of where the joints are. Lengths are in
+centimetres and y points up, both as well as the cameras were calibrated, which was from the dancers alone; where the
+ground is nobody measured: here it is so far below the ankles that they are as high as ours are when we stand.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from larp_model.names import meant, require_file
+from tasks.keypoints import arrays
+from tasks.keypoints.camera import Camera
+from tasks.keypoints.formats import ORDERS
+from tasks.keypoints.points import POINTS, Keypoints
+
+# Frames a second, of all films; how many cameras there are.
+RATE, CAMERAS = 60.0, 9
+# How high ankles are where feet stand [m], as our figure's; and how many of the lowest are taken for errors [%].
+ANKLE, ASTRAY = 0.067, 5.0
+# Cameras that AIST++ leaves out itself: one that is not in time with the others, one with smaller images.
+UNUSABLE = {"gBR_sBM_cAll_d04_mBR0_ch01": 4, "gJB_sBM_cAll_d07_mJB3_ch05": 6}
+# Of a camera: size and matrix [px], turn from the world as a rotation vector, shift [cm], and what bends its rays.
+FIELDS = {"size": (2,), "matrix": (3, 3), "rotation": (3,), "translation": (3,), "distortions": (5,)}
+# From its world, y up, to ours.
+TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+_COUNT = len(ORDERS[17])
+_KNOWN = [row for row, name in enumerate(POINTS) if name in ORDERS[17]]
+_THEIRS = [ORDERS[17].index(POINTS[row]) for row in _KNOWN]
+_ANKLES = [POINTS.index("left_ankle"), POINTS.index("right_ankle")]
+
+
+class Dance(NamedTuple):
+    """A film: what a detector found, its camera, and where `POINTS` truly are (T, P, 3) [m], NaN where not known.
+
+    Heels and toes are never known.
+    """
+
+    keypoints: Keypoints
+    camera: Camera
+    points: np.ndarray
+
+
+def sequences(folder: Path) -> dict[str, str]:
+    """The setting of the cameras by the name of each sequence, those left out that AIST++ itself found faulty."""
+    mapping, ignored = folder / "cameras" / "mapping.txt", folder / "ignore_list.txt"
+    if not folder.is_dir():
+        raise ValueError(f"aist is {str(folder)!r}, but must be the folder of AIST++'s annotations")
+    require_file("aist", mapping)
+    rows = [line.split() for line in mapping.read_text(encoding="utf-8").splitlines() if line.strip()]
+    if not rows or any(len(row) != 2 for row in rows):
+        raise ValueError("aist: mapping.txt needs a sequence and its setting in every line")
+    faulty = set(ignored.read_text(encoding="utf-8").split()) if ignored.is_file() else set()
+    return {sequence: setting for sequence, setting in rows if sequence not in faulty}
+
+
+def seen_by(name: str) -> tuple[str, int | None]:
+    """The sequence of a video, and which camera made it, from 0; a sequence's own name, with cAll, is of no camera."""
+    found = re.search(rf"_c0([1-{CAMERAS}])_", name)
+    return (name.replace(found[0], "_cAll_", 1), int(found[1]) - 1) if found else (name, None)
+
+
+def video(sequence: str, camera: int) -> str:
+    """The name of what one camera, from 0, made of a sequence."""
+    return sequence.replace("_cAll_", f"_c{camera + 1:02}_")
+
+
+def load(folder: Path, sequence: str, camera: int) -> Dance:
+    """What one camera, from 0, saw of a sequence; ValueError, in one line, says what is missing or damaged.
+
+    Distortion is taken out of the keypoints, so that the camera has none; so is a focal length that differs across.
+    """
+    settings = sequences(folder)
+    if sequence not in settings:
+        raise ValueError(
+            f"sequences has {sequence!r}, but mapping.txt in aist has no such sequence, or ignore_list.txt has it too"
+            f"{meant(sequence, settings)}"
+        )
+    if camera not in range(CAMERAS):
+        raise ValueError(f"camera is {camera}, but must be from 0 to below {CAMERAS}")
+    if UNUSABLE.get(sequence) == camera:
+        raise ValueError(f"sequences has {video(sequence, camera)!r}, a camera that AIST++ leaves out itself")
+    seen = _array(folder / "keypoints2d" / f"{sequence}.pkl", "keypoints2d", (CAMERAS, None, _COUNT, 3))[camera]
+    true = _array(folder / "keypoints3d" / f"{sequence}.pkl", "keypoints3d_optim", (None, _COUNT, 3))
+    if len(seen) != len(true):
+        raise ValueError(f"aist: {sequence} has {len(seen)} frames in keypoints2d and {len(true)} in keypoints3d")
+
+    points = np.full((len(true), len(POINTS), 3), np.nan)
+    points[:, _KNOWN] = 0.01 * true[:, _THEIRS] @ TURN.T
+    lowest = points[:, _ANKLES, 2].min(axis=1)
+    if np.isnan(lowest).all():
+        raise ValueError(f"aist: {sequence}.pkl has no frame in keypoints3d_optim with both ankles")
+    ground = np.array([0.0, 0.0, float(np.nanpercentile(lowest, ASTRAY)) - ANKLE])
+
+    held = _camera(folder / "cameras" / f"{settings[sequence]}.json", camera)
+    (width, height), spread, centre = held["size"], held["matrix"][[0, 1], [0, 1]], held["matrix"][:2, 2]
+    turn, focal = Rotation.from_rotvec(held["rotation"]).as_matrix(), float(spread[0])
+    position = -0.01 * TURN @ turn.T @ held["translation"]
+
+    places, confidence = np.full((len(seen), len(POINTS), 2), np.nan), np.zeros((len(seen), len(POINTS)))
+    straight = undistorted((seen[:, _THEIRS, :2] - centre) / spread, held["distortions"])
+    places[:, _KNOWN] = focal * straight + centre
+    confidence[:, _KNOWN] = np.nan_to_num(seen[:, _THEIRS, 2]).clip(0.0, 1.0)
+    confidence[np.isnan(places).any(axis=-1)] = 0.0
+    places[confidence == 0.0] = np.nan
+    return Dance(
+        Keypoints(places, confidence, RATE, (float(width), float(height))),
+        Camera(focal, centre, turn @ TURN.T, position - ground),
+        points - ground,
+    )
+
+
+def undistorted(places: np.ndarray, distortion: np.ndarray) -> np.ndarray:
+    """Places (*, 2) one length ahead of the camera, its distortion (k1, k2, p1, p2, k3 of OpenCV) taken out.
+
+    By fixed-point iteration, which the little that these lenses distort lets converge.
+    """
+    k1, k2, p1, p2, k3 = distortion
+    found = places
+    for _ in range(20):
+        x, y = found[..., 0], found[..., 1]
+        square = x**2 + y**2
+        radial = 1.0 + square * (k1 + square * (k2 + square * k3))
+        aside = np.stack(
+            [2.0 * p1 * x * y + p2 * (square + 2.0 * x**2), p1 * (square + 2.0 * y**2) + 2.0 * p2 * x * y], axis=-1
+        )
+        found = (places - aside) / radial[..., None]
+    return found
+
+
+def _camera(path: Path, which: int) -> dict[str, np.ndarray]:
+    """The numbers of `FIELDS` of one of the cameras of a setting."""
+    require_file("aist", path)
+    try:
+        cameras = json.loads(path.read_bytes())
+    except (ValueError, RecursionError):
+        raise ValueError(f"aist: {path.name} is no JSON file") from None
+    if not isinstance(cameras, list) or len(cameras) != CAMERAS or not isinstance(cameras[which], dict):
+        raise ValueError(f"aist: {path.name} needs a list of {CAMERAS} cameras")
+    held = {}
+    for field, shape in FIELDS.items():
+        try:
+            held[field] = np.array(cameras[which].get(field), float)
+        except (TypeError, ValueError, OverflowError):
+            held[field] = np.array(np.nan)
+        if held[field].shape != shape or not np.isfinite(held[field]).all():
+            needed = " x ".join(map(str, shape))
+            raise ValueError(f"aist: {path.name}, camera {which}: {field} needs {needed} finite numbers")
+    if not ((held["size"] > 0.0).all() and (held["matrix"][[0, 1], [0, 1]] > 0.0).all()):
+        raise ValueError(f"aist: {path.name}, camera {which}: size and the matrix' focal lengths must be above 0")
+    return held
+
+
+def _array(path: Path, name: str, shape: tuple[int | None, ...]) -> np.ndarray:
+    require_file("aist", path)
+    held: Any = arrays.load(path)
+    found = held.get(name) if isinstance(held, dict) else None
+    needs = ", ".join("T" if length is None else str(length) for length in shape)
+    if not isinstance(found, np.ndarray) or found.dtype.kind != "f":
+        raise ValueError(f"aist: {path.name} needs {name}, floats ({needs})")
+    if found.ndim != len(shape) or not all(
+        wanted in (None, own) for wanted, own in zip(shape, found.shape, strict=True)
+    ):
+        raise ValueError(f"aist: {path.name} has {name} {found.shape}, but needs ({needs})")
+    if np.isinf(found).any():
+        raise ValueError(f"aist: {path.name} has {name} with numbers that are infinite")
+    return found.astype(float)
