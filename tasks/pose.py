@@ -31,7 +31,7 @@ from mpc.loop import Begun, Execution
 from tasks.command import Teller, remember_compilations, run
 from tasks.keypoints import camera as cameras
 from tasks.keypoints import figure as figures
-from tasks.keypoints import formats, lift, physical
+from tasks.keypoints import formats, lift, metrics, physical
 from tasks.keypoints.kept import Kept, Spent, fingerprint
 from tasks.keypoints.picture import pose_picture
 from tasks.keypoints.points import Keypoints
@@ -54,6 +54,8 @@ OFTEN = 5.0
 HEIGHTS = 1.3, 2.2
 # Frames that are needed, and a median error [shares of the image] beyond which the figure does not fit the person.
 LEAST, ASTRAY = 10, 0.03
+# Feet of who is filmed by a camera that stands still slip less [m/s].
+SLIPPING = 0.12
 
 
 def simulated(figure: figures.Figure, proportions: np.ndarray, manifest: Path) -> Body:
@@ -244,6 +246,9 @@ def main(
     image = 2.0 * np.asarray(lens.centre)
     if lifted.error > ASTRAY * image.max():
         tell(f"half of the points are more than {lifted.error:.0f} px off: does the camera move, or is it another one?")
+    slip = metrics.slip(figures.figure().all_points(lifted.pose, lifted.proportions), film.rate)
+    if slip > SLIPPING:
+        tell(f"the feet slip, by {slip:.2f} m/s where they ought to stand: does the camera move, or the ground?")
     with tell.bar("planning and executing") as at:
         made = reconstruct(film, lifted, dynamics, seed, kept, at)
     apart = np.linalg.norm(lifted.camera.project(made.found) - film.places, axis=-1)[film.seen]
@@ -256,6 +261,8 @@ def main(
         "camera_m": np.asarray(lifted.camera.position, float).tolist(),
         "focal_px": float(lifted.camera.focal),
         "kinematic_error_px": lifted.error,
+        "slip_m_s": slip,
+        "camera_seems_to_move": slip > SLIPPING,
         "error_px": float(np.median(apart)),
         "fell": made.fell,
         "plan_seconds": made.spent.seconds,

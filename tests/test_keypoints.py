@@ -167,6 +167,14 @@ class TestMetrics:
         points[:, :, 2] += 0.2
         assert metrics.foot_skate(points) == 0.0
 
+    def test_feet_that_take_turns_in_standing_do_not_slip_unless_all_is_carried_along(self) -> None:
+        points, time = np.zeros((60, len(POINTS), 3)), np.arange(60) / 30.0
+        left, right = (np.maximum(sign * np.sin(6.0 * time), 0.0) for sign in (1.0, -1.0))
+        points[:, metrics.FEET["left"], 0], points[:, metrics.FEET["right"], 0] = left[:, None], right[:, None]
+        assert metrics.slip(points, 30.0) < 0.01
+        points[:, :, 1] += 0.4 * time[:, None]
+        assert metrics.slip(points, 30.0) == pytest.approx(0.4, abs=0.1)
+
     def test_depth_in_the_ground_is_told(self) -> None:
         points = np.ones((4, len(POINTS), 3))
         points[0, metrics.FEET["left"], 2] = -0.04

@@ -49,6 +49,7 @@ def test_a_film_becomes_a_motion_in_mujoco_and_a_reference(film: dict[str, Any],
     camera.write_text(json.dumps({"focal": lens.focal, "position": lens.position.tolist(), "look_at": at}))
     pose.main(written(tmp_path, film["keypoints"]), camera=camera, out=out, quiet=True)
     summary = json.loads((out / "summary.json").read_text())
+    assert not summary["camera_seems_to_move"] and summary["slip_m_s"] < pose.SLIPPING
     assert not summary["fell"] and summary["error_px"] < 25.0 and summary["candidates"] > 100
     assert summary["height_m"] == pytest.approx(1.75, abs=0.15)
     assert (out / "pose.png").read_bytes().startswith(b"\x89PNG")
@@ -87,6 +88,24 @@ def test_a_reconstruction_that_was_cut_off_goes_on_as_if_it_had_not_been(
     np.testing.assert_allclose(other.path("Hips"), one.path("Hips"), atol=0.01)
     first, second = (json.loads((folder / "summary.json").read_text()) for folder in (whole, again))
     assert first["candidates"] == second["candidates"]
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_a_film_by_a_camera_that_follows_the_person_is_told_of(
+    moves: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    random, true = np.random.default_rng(4), benchmark.filmed_points(None, 2.0)[::2]
+    lens, camera = filmed.camera_around(random, true), tmp_path / "camera.json"
+    camera.write_text(json.dumps({"focal": lens.focal}))
+    seen = filmed.seen(random, lens, filmed.panned(lens, true) if moves else true, 0.5 * benchmark.RATE)
+
+    def enough(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pose, "reconstruct", enough)
+    with pytest.raises(KeyboardInterrupt):
+        pose.main(written(tmp_path, seen), camera=camera, out=tmp_path / "pose")
+    assert ("does the camera move" in capsys.readouterr().out) == moves
 
 
 def test_what_was_kept_of_another_film_or_is_damaged_is_of_no_use(film: dict[str, Any], tmp_path: Path) -> None:

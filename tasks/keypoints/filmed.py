@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tasks.keypoints.camera import Camera, focal_length, looking
+from tasks.keypoints.metrics import pelvis
 from tasks.keypoints.points import POINTS, SIDES, Keypoints
 from tasks.motions.skeleton import Motion
 
@@ -90,6 +91,12 @@ def seen(
             missed[begin : begin + round(0.3 * rate), point] = True
     places[missed], confidence[missed] = np.nan, 0.0
     return Keypoints(places, confidence, rate, SIZE)
+
+
+def panned(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Points (T, P, 3) [m] that the camera sees as it would the given ones if it turned after the pelvis."""
+    turns = [looking(camera.position, each[0], camera.focal, SIZE).turn for each in pelvis(points)]
+    return camera.position + np.einsum("ji,tjk,tpk->tpi", camera.turn, turns, points - camera.position)
 
 
 def _normal(random: np.random.Generator, *shape: int) -> np.ndarray:

@@ -19,6 +19,8 @@ FEET = {side: [POINTS.index(f"{side}_heel"), POINTS.index(f"{side}_toe")] for si
 SKATE = 0.02
 # A foot is in contact where neither its heel nor its toe is higher above the ground [m].
 CONTACT = 0.05
+# Of how long a foot's speed is the mean [s].
+STRIDE = 0.1
 
 
 def pelvis(points: np.ndarray) -> np.ndarray:
@@ -81,6 +83,17 @@ def foot_skate(points: np.ndarray) -> float:
         moved = np.linalg.norm(np.diff(points[:, rows].mean(axis=1), axis=0), axis=-1)
         skating = np.logical_or(skating, low[:-1] & low[1:] & (moved > SKATE))
     return 100.0 * float(skating.mean())
+
+
+def slip(points: np.ndarray, rate: float) -> float:
+    """Speed [m/s] of the heel or toe that is slowest, in three quarters of the frames at most; points (T, P, 3) [m].
+
+    Who is on foot has one that nearly stands most of the time, whatever the motion; unless the camera moves.
+    """
+    feet = points[:, [row for rows in FEET.values() for row in rows]]
+    frames = max(1, round(STRIDE * rate))
+    slowest = np.linalg.norm(feet[frames:] - feet[:-frames], axis=-1).min(axis=1) * rate / frames
+    return float(np.percentile(slowest, 75.0))
 
 
 def pixel_error(places: np.ndarray, true: np.ndarray) -> float:
