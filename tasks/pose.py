@@ -26,7 +26,7 @@ from larp_model.files import require_writable, write_whole
 from larp_model.scene import Body, Scene
 from larp_model.simulator import Simulator
 from larp_model.truth.mujoco import SUBSTEPS, Truth
-from mpc import Dynamics, GaussNewton, MujocoDynamics
+from mpc import Dynamics, MujocoDynamics
 from mpc.loop import Begun, Execution
 from tasks.command import Teller, remember_compilations, run
 from tasks.keypoints import camera as cameras
@@ -37,11 +37,10 @@ from tasks.keypoints.picture import pose_picture
 from tasks.keypoints.points import Keypoints
 from tasks.models import ROWS, DynamicsName
 from tasks.motions import angles, bvh
+from tasks.presets import PresetName
 from tasks.scenarios import ANY_HUMAN
 from viewer import Overlay, write_overlay
 
-# Of each plan.
-STEPS = GaussNewton(rounds=2, directions=32)
 # Of states and controls [s], as every scene's by default.
 DT = 0.01
 # Of the learned model, whatever a film shows.
@@ -120,13 +119,15 @@ def reconstruct(
     film: Keypoints,
     lifted: lift.Lifted,
     dynamics: DynamicsName = "larp",
+    preset: physical.Preset = physical.PRESETS["balanced"],
     seed: int = 0,
     kept: Kept | None = None,
     at: Callable[[int, int], None] = lambda step, steps: None,
 ) -> Reconstruction:
     """The physical motion from the kinematic start on, by a planner whose model is LARP or MuJoCo.
 
-    kept: to go on from, and to keep what is done in. at: called after every step, with their number.
+    preset: what a plan may cost. kept: to go on from, and to keep what is done in. at: called after every step, with
+    their number.
     """
     figure = figures.figure()
     body = simulated(figure, lifted.proportions, MANIFEST)
@@ -139,7 +140,7 @@ def reconstruct(
     wanted = physical.wanted_of(scene, figure, lifted, film)
     points = physical.Seen(body, figure, lifted.proportions)
     sigma = lift.PIXELS * 2.0 * float(np.max(lifted.camera.centre))
-    planner = physical.planner_of(scene, points, lifted.camera, sigma, model, (STEPS,))
+    planner = physical.planner_of(scene, points, lifted.camera, sigma, model, preset)
     spent, counted, saved = Spent() if kept is None else kept.spent, 0, time.monotonic()
 
     def observe(execution: Execution) -> None:
@@ -153,7 +154,7 @@ def reconstruct(
         at(len(execution.controls), len(wanted.states) - 1)
 
     begun, state = None if kept is None else kept.begun, physical.started(scene, wanted)
-    execution = physical.fit(scene, planner, wanted, state, seed, observe, begun)
+    execution = physical.fit(scene, planner, wanted, state, preset.every, seed, observe, begun)
     states = np.stack(execution.states)
     frames = np.minimum(np.rint(np.arange(len(film)) / film.rate / scene.dt).astype(int), len(states) - 1)
     return Reconstruction(
@@ -186,6 +187,7 @@ def main(
     person: int | None = None,
     height: float | None = None,
     dynamics: DynamicsName = "larp",
+    preset: PresetName = "balanced",
     seed: int = 0,
     out: Path = Path("runs/pose"),
     quiet: bool = False,
@@ -203,6 +205,7 @@ def main(
         height: of the person (m); where it is not known, it is estimated by a camera whose position is, and taken to be
             1.75 m by any other.
         dynamics: the planner's model: larp (learned) or mujoco.
+        preset: how much the plans may cost.
         seed: of the planner's random numbers.
         out: folder for summary.json, pose.npz and pose.bvh (each a reference for tasks.kick), pose.png,
             and pose.html, a replay under the keypoints.
@@ -234,8 +237,11 @@ def main(
         lens.position,
         known,
         height or 0.0,
+        dynamics,
+        repr(physical.PRESETS[preset]),
+        seed,
     )
-    kept = Kept(out / "unfinished.npz", fingerprint(*given, dynamics, seed, MANIFEST.read_bytes()))
+    kept = Kept(out / "unfinished.npz", fingerprint(*given, MANIFEST.read_bytes()))
     if kept.lifted is None:
         with tell.part(f"laying a figure over {len(film)} frames"):
             lifted = lift.lift(film, lens, known, height)
@@ -250,7 +256,7 @@ def main(
     if slip > SLIPPING:
         tell(f"the feet slip, by {slip:.2f} m/s where they ought to stand: does the camera move, or the ground?")
     with tell.bar("planning and executing") as at:
-        made = reconstruct(film, lifted, dynamics, seed, kept, at)
+        made = reconstruct(film, lifted, dynamics, physical.PRESETS[preset], seed, kept, at)
     apart = np.linalg.norm(lifted.camera.project(made.found) - film.places, axis=-1)[film.seen]
     summary = {
         "frames": len(film),
@@ -270,6 +276,7 @@ def main(
         "candidates": made.spent.candidates,
         "candidates_lost": made.spent.lost,
         "dynamics": dynamics,
+        "preset": preset,
         "seed": seed,
     }
     if made.fell:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -14,6 +15,7 @@ from rich.table import Table
 
 from larp_model.bodies import human_and_ball
 from larp_model.names import require_file
+from mpc.gauss_newton import FACTORS
 from tasks.benchmarks import report
 from tasks.command import remember_compilations, run
 from tasks.keypoints import aist as dances
@@ -26,12 +28,13 @@ from tasks.models import DynamicsName
 from tasks.motions import skeleton
 from tasks.motions.references import embedded, motion_of
 from tasks.pose import reconstruct, shown
+from tasks.presets import PresetName
 
 # Frames a second of a film, and of it what lies before a kick's strike, as a share.
 RATE, BEFORE = 60.0, 0.63
-Way = Literal["kinematic", "larp", "mujoco"]
+Way = Literal["kinematic", "larp", "mujoco", "mujoco_timed"]
 WAYS: tuple[Way, ...] = ("kinematic", "larp", "mujoco")
-COLORS = {"kinematic": "#9aa5b1", "larp": "#1f6fb2", "mujoco": "#e69f00"}
+COLORS = {"kinematic": "#9aa5b1", "larp": "#1f6fb2", "mujoco": "#e69f00", "mujoco_timed": "#b3541e"}
 # What is told of each way: its name in the JSON, what a person reads, and its unit.
 TOLD = {
     "mpjpe_g_mm": ("MPJPE-G", "mm"),
@@ -139,7 +142,15 @@ def dances_of(folder: Path, names: Sequence[str], cameras: int, seconds: float) 
     return films
 
 
-def measured(film: Callable[[], Film], ways: Sequence[Way], seed: int) -> dict[str, Any]:
+def as_fast(preset: physical.Preset, share: float) -> physical.Preset:
+    """A preset of which each plan tries a share of the candidates, in one round."""
+    steps = preset.steps
+    tried = 1 + steps.rounds * (steps.directions + len(FACTORS))
+    directions = max(1, round(share * tried) - 1 - len(FACTORS))
+    return preset._replace(steps=replace(steps, rounds=1, directions=directions))
+
+
+def measured(film: Callable[[], Film], ways: Sequence[Way], preset: physical.Preset, seed: int) -> dict[str, Any]:
     """One film, reconstructed in each way."""
     name, keypoints, lens, true = film()
     lifted = lift.lift(keypoints, lens)
@@ -158,12 +169,15 @@ def measured(film: Callable[[], Film], ways: Sequence[Way], seed: int) -> dict[s
     }
     if not math.isnan(skate := metrics.foot_skate(true)):
         row["true_foot_skate"] = skate
-    names: dict[Way, DynamicsName] = {"larp": "larp", "mujoco": "mujoco"}
+    names: dict[Way, DynamicsName] = {"larp": "larp", "mujoco": "mujoco", "mujoco_timed": "mujoco"}
     for way in ways:
         if way == "kinematic":
             row[way] = judged(figures.figure().all_points(lifted.pose, lifted.proportions))
             continue
-        made = reconstruct(keypoints, lifted, names[way], seed)
+        tried = preset
+        if way == "mujoco_timed":
+            tried = as_fast(preset, row["larp"]["plan_seconds"] / row["mujoco"]["plan_seconds"])
+        made = reconstruct(keypoints, lifted, names[way], tried, seed)
         row[way] = judged(made.found) | {
             "fell": 100.0 * made.fell,
             "plan_seconds": made.spent.seconds,
@@ -199,6 +213,7 @@ def main(
     cameras: int = 2,
     seconds: float = 2.5,
     ways: tuple[Way, ...] = WAYS,
+    preset: PresetName = "balanced",
     seed: int = 0,
     json: Path = Path("runs/benchmarks/pose.json"),
     publish: bool = False,
@@ -212,7 +227,9 @@ def main(
             camera 6 alone); 15 videos that others take by default, as far as the folder has them, else all that it has.
         cameras: that see each of them, somewhere around it; of aist, the first.
         seconds: of each film, at 60 frames a second; of aist, the first.
-        ways: the kinematic start alone, or followed by a planner whose model is larp or mujoco.
+        ways: the kinematic start alone, or followed by a planner whose model is larp or mujoco, with as many candidates
+            each; mujoco_timed has so few that it takes about larp's time, and comes after both.
+        preset: how much a plan may cost.
         seed: of cameras, detector and planner.
         json: where the figures go; the picture goes beside them.
         publish: put the table into RESULTS.md.
@@ -225,6 +242,8 @@ def main(
         raise ValueError(f"seconds is {seconds:g}, but must be from 0.4 to 60")
     if not ways or len(set(ways)) != len(ways):
         raise ValueError(f"ways are {', '.join(ways) or 'none'}, but must be some of {', '.join(WAYS)}, each once")
+    if "mujoco_timed" in ways and not {"larp", "mujoco"} <= set(ways[: ways.index("mujoco_timed")]):
+        raise ValueError("ways has mujoco_timed, but needs larp and mujoco before it, whose times it goes by")
     if clips and aist is not None:
         raise ValueError("clips and aist are both set, but films are made of one of them")
     if sequences and aist is None:
@@ -244,8 +263,9 @@ def main(
     if aist is not None:
         named = f" --aist {aist.name}" + (f" --sequences {' '.join(sequences)}" if sequences else "")
     chosen = "" if ways == WAYS else f" --ways {' '.join(ways)}"
+    chosen += "" if preset == "balanced" else f" --preset {preset}"
     command = f"python -m tasks.benchmarks.pose{named} --cameras {cameras} --seconds {seconds:g}{chosen} --seed {seed}"
-    jobs = {name: partial(measured, film, ways, seed) for name, film in films.items()}
+    jobs = {name: partial(measured, film, ways, physical.PRESETS[preset], seed) for name, film in films.items()}
     rows = report.collect(json, command, jobs)
     found = {way: means(rows, way) for way in ways}
     content = {"command": command, "hardware": report.hardware(), "means": found, "rows": rows}

@@ -27,7 +27,7 @@ from larp_model import state as packed
 from larp_model.rotation import matrix
 from larp_model.scene import Body, Scene, anchor
 from larp_model.truth.mujoco import Truth, closed
-from mpc import CostTerm, Dynamics, Optimizer, Planner, quadratic
+from mpc import CostTerm, Dynamics, GaussNewton, Planner, quadratic
 from mpc.loop import Begun, Execution, Phase, Window, execute
 from tasks.data import stray
 from tasks.keypoints.camera import Camera
@@ -35,14 +35,30 @@ from tasks.keypoints.figure import Figure, Pose
 from tasks.keypoints.lift import OUTLIER, PIXELS, SLOW, Lifted
 from tasks.keypoints.points import FEET, POINTS, Keypoints
 from tasks.motions.references import clearance, leading
-from tasks.presets import usable
+from tasks.presets import PresetName
 
-HORIZON, KNOTS, EVERY = 50, 11, 5
 # Spread of a first plan, as a share of how far the training data strays from its motions.
 SEARCH = 0.5
 # What counts as one unit of each cost: distances [m] and velocities [m/s] off the kinematic
 # start's, a standing foot's speed [m/s].
 NEAR, PACE, STILL = 0.05, 0.5, 0.3
+
+
+class Preset(NamedTuple):
+    """How much a fit may cost: steps that a plan looks ahead and its knots, how it is found, steps between plans."""
+
+    horizon: int
+    knots: int
+    steps: GaussNewton
+    every: int = 5
+
+
+# Who looks only half a second ahead sees too late that a start leans too far, and falls.
+PRESETS: dict[PresetName, Preset] = {
+    "fast": Preset(80, 11, GaussNewton(rounds=2, directions=48)),
+    "balanced": Preset(80, 17, GaussNewton(rounds=4, directions=64)),
+    "accurate": Preset(80, 17, GaussNewton(rounds=8, directions=64)),
+}
 
 
 class Wanted(NamedTuple):
@@ -159,14 +175,12 @@ def terms_of(seen: Seen, camera: Camera, sigma: float, dt: float) -> tuple[CostT
     )
 
 
-def planner_of(
-    scene: Scene, seen: Seen, camera: Camera, sigma: float, dynamics: Dynamics, optimizers: tuple[Optimizer, ...]
-) -> Planner:
+def planner_of(scene: Scene, seen: Seen, camera: Camera, sigma: float, dynamics: Dynamics, preset: Preset) -> Planner:
     """A planner of these costs; sigma: standard deviation of the keypoints [px]."""
     bounds = np.array([(motor.lower, motor.upper) for motor in scene.motors])
     return Planner(
-        dynamics, terms_of(seen, camera, sigma, scene.dt), HORIZON, KNOTS, scene.dt, SEARCH * stray(scene),
-        usable(dynamics, optimizers), bounds[:, 0], bounds[:, 1],
+        dynamics, terms_of(seen, camera, sigma, scene.dt), preset.horizon, preset.knots, scene.dt,
+        SEARCH * stray(scene), preset.steps, bounds[:, 0], bounds[:, 1],
     )  # fmt: skip
 
 
@@ -179,17 +193,20 @@ def started(scene: Scene, wanted: Wanted) -> np.ndarray:
 
 
 def fit(
-    scene: Scene, planner: Planner, wanted: Wanted, state: np.ndarray, seed: int = 0,
+    scene: Scene, planner: Planner, wanted: Wanted, state: np.ndarray, every: int, seed: int = 0,
     observe: Callable[[Execution], None] = lambda execution: None, begun: Begun | None = None,
 ) -> Execution:  # fmt: skip
-    """Plan and execute in the truth, from a state (L, 13) on, until what is wanted ends; see `mpc.loop.execute`."""
-    steps = len(wanted.states) - 1
+    """Plan and execute in the truth, from a state (L, 13) on, until what is wanted ends; see `mpc.loop.execute`.
+
+    every: steps between plans.
+    """
+    steps, horizon = len(wanted.states) - 1, planner.horizon
 
     def window(step: int) -> Window:
-        after = np.minimum(step + 1 + np.arange(HORIZON), steps)
-        now = np.minimum(step + np.arange(HORIZON), steps)
+        after = np.minimum(step + 1 + np.arange(horizon), steps)
+        now = np.minimum(step + np.arange(horizon), steps)
         context = Wanted(*(each[after] for each in wanted))._replace(targets=wanted.targets[now])
         return Window(wanted.targets[now], context)
 
-    phase = Phase(planner, planner, EVERY, window)
+    phase = Phase(planner, planner, every, window)
     return execute(Truth(scene, 1), state, [phase], steps, jax.random.key(seed), scene.dt, observe, begun=begun)
