@@ -139,8 +139,7 @@ def reconstruct(
         model = MujocoDynamics(Truth(scene, ROWS, SUBSTEPS))
     wanted = physical.wanted_of(scene, figure, lifted, film)
     points = physical.Seen(body, figure, lifted.proportions)
-    sigma = lift.PIXELS * 2.0 * float(np.max(lifted.camera.centre))
-    planner = physical.planner_of(scene, points, lifted.camera, sigma, model, preset)
+    planner = physical.planner_of(scene, points, lifted.camera, lift.noise(film, lifted.camera), model, preset)
     spent, counted, saved = Spent() if kept is None else kept.spent, 0, time.monotonic()
 
     def observe(execution: Execution) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from larp_model.bodies import human_and_ball
+from mpc.gauss_newton import FACTORS
 from tasks import pose
 from tasks.benchmarks import pose as benchmark
 from tasks.command import Teller, run
@@ -47,7 +48,7 @@ def test_a_film_becomes_a_motion_in_mujoco_and_a_reference(film: dict[str, Any],
     at = (lens.position + 3.0 * lens.turn[2]).tolist()
     camera = tmp_path / "camera.json"
     camera.write_text(json.dumps({"focal": lens.focal, "position": lens.position.tolist(), "look_at": at}))
-    pose.main(written(tmp_path, film["keypoints"]), camera=camera, out=out, quiet=True)
+    pose.main(written(tmp_path, film["keypoints"]), camera=camera, preset="fast", out=out, quiet=True)
     summary = json.loads((out / "summary.json").read_text())
     assert not summary["camera_seems_to_move"] and summary["slip_m_s"] < pose.SLIPPING
     assert not summary["fell"] and summary["error_px"] < 25.0 and summary["candidates"] > 100
@@ -69,7 +70,7 @@ def test_a_reconstruction_that_was_cut_off_goes_on_as_if_it_had_not_been(
     whole, again = tmp_path / "whole", tmp_path / "again"
     short = film["keypoints"].cut(0, 19)
     keypoints = written(tmp_path, short)
-    pose.main(keypoints, out=whole, quiet=True)
+    pose.main(keypoints, preset="fast", out=whole, quiet=True)
 
     def interrupted(step: int, steps: int) -> None:
         if step >= 17:
@@ -78,10 +79,10 @@ def test_a_reconstruction_that_was_cut_off_goes_on_as_if_it_had_not_been(
     with monkeypatch.context() as changed:
         changed.setattr(Teller, "bar", lambda self, what: nullcontext(interrupted))
         with pytest.raises(KeyboardInterrupt):
-            pose.main(keypoints, out=again, quiet=True)
+            pose.main(keypoints, preset="fast", out=again, quiet=True)
     assert [path.name for path in again.iterdir()] == ["unfinished.npz"]
     capsys.readouterr()
-    pose.main(keypoints, out=again)
+    pose.main(keypoints, preset="fast", out=again)
     assert "17 steps done" in capsys.readouterr().out
     assert sorted(path.name for path in again.iterdir()) == sorted(path.name for path in whole.iterdir())
     one, other = (angles.load(folder / "pose.npz") for folder in (whole, again))
@@ -176,12 +177,23 @@ def test_the_benchmark_tells_how_far_a_reconstruction_is_from_what_was_filmed(tm
     assert path.with_suffix(".png").is_file()
 
 
+@pytest.mark.parametrize("share", [0.1, 0.5])
+def test_a_slow_model_is_given_as_many_candidates_as_it_has_time_for(share: float) -> None:
+    preset = physical.PRESETS["balanced"]
+
+    def candidates(preset: physical.Preset) -> int:
+        return 1 + preset.steps.rounds * (preset.steps.directions + len(FACTORS))
+
+    assert candidates(benchmark.as_fast(preset, share)) == pytest.approx(share * candidates(preset), abs=1.0)
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         ({"cameras": 0}, "cameras is 0"),
         ({"seconds": 0.1}, "seconds is 0.1, but must be from 0.4 to 60"),
         ({"ways": ("larp", "larp")}, "each once"),
+        ({"ways": ("larp", "mujoco_timed", "mujoco")}, "mujoco_timed, but needs larp and mujoco before it"),
         ({"clips": (Path("nowhere.bvh"),)}, "clips is 'nowhere.bvh', but no such file exists"),
     ],
 )

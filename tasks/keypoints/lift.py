@@ -49,8 +49,8 @@ STILL, LEVEL, SUNK, SLOW, LOW = 0.10, 0.015, 0.005, 0.8, 0.08
 # Residuals beyond so many standard deviations count less and less.
 OUTLIER = 6.0
 STEPS = 40
-# Of the body's height where it is known, or of its size where it is not known how high a camera stands: no image tells
-# it then, and what is small jerks least.
+# Of the body's height, where it is known or a camera is not: then no image tells it, what is small jerks least, and
+# people are taken to be as tall as usual.
 UNSEEN = 0.005
 # Of where the weight is borne, beside the feet that stand [m]; the mass that is nearest to each point, as a share.
 BORNE = 0.08
@@ -100,12 +100,12 @@ class _Lifter:
 
     def __init__(self, keypoints: Keypoints, camera: Camera, known: bool, height: float | None) -> None:
         self.keypoints, self.camera, self.known, self.figure = keypoints, camera, known, figure()
-        size = keypoints.size or tuple(2.0 * camera.centre)
-        self.sigma = PIXELS * max(size)
+        self.sigma = noise(keypoints, camera)
         self.alone = Alone(keypoints, camera, self.sigma)
         unknown = (1e-4, 1e-4, 1e-4) if known else (TILT, ROLL, HEIGHT)
-        grown = GROWN if known or height is not None else UNSEEN
-        seconds, sigma = len(keypoints) / keypoints.rate, np.array([grown, *VARIED, *unknown, SOLES, SOLES])
+        if height is None and not known:
+            height = USUAL
+        seconds, sigma = len(keypoints) / keypoints.rate, np.array([GROWN, *VARIED, *unknown, SOLES, SOLES])
         self.usual, self.prior = np.zeros(COMMON), seconds * np.diag(1.0 / sigma**2)
         if height is not None:  # which all proportions together have
             along = np.zeros(COMMON)
@@ -266,6 +266,11 @@ class _Lifter:
         return by_rows(lambda turn, change: function(self.figure, camera, turn, change, common), pose.turn, change)
 
 
+def noise(keypoints: Keypoints, camera: Camera) -> float:
+    """Standard deviation [px] of what a detector found."""
+    return PIXELS * float(max(keypoints.size or 2.0 * np.asarray(camera.centre)))
+
+
 def second_differences(values: np.ndarray) -> np.ndarray:
     """Second differences (T - 2, ...) along the frames."""
     return values[2:] - 2.0 * values[1:-1] + values[:-2]
@@ -281,7 +286,7 @@ def lift(keypoints: Keypoints, camera: Camera, known: bool = True, height: float
     """The figure in all frames, of which the first and the last show most of a person.
 
     known: whether it is known where the camera stands; else its tilt and height are estimated, from the given ones on.
-    height: of the person [m], where it is known.
+    height: of the person [m], where it is known; the usual one by default where the camera is not known.
     """
     lifter = _Lifter(keypoints, camera, known, height)
     pose, shared = lifter.solved()

@@ -32,9 +32,9 @@ from mpc.loop import Begun, Execution, Phase, Window, execute
 from tasks.data import stray
 from tasks.keypoints.camera import Camera
 from tasks.keypoints.figure import Figure, Pose
-from tasks.keypoints.lift import OUTLIER, PIXELS, SLOW, Lifted
+from tasks.keypoints.lift import OUTLIER, SLOW, Lifted, noise
 from tasks.keypoints.points import FEET, POINTS, Keypoints
-from tasks.motions.references import clearance, leading
+from tasks.motions.references import clearance, leading, spinning
 from tasks.presets import PresetName
 
 # Spread of a first plan, as a share of how far the training data strays from its motions.
@@ -91,15 +91,13 @@ def wanted_of(scene: Scene, figure: Figure, lifted: Lifted, keypoints: Keypoints
         turns.append(turns[joint.parent] * Rotation.from_rotvec(angles[:, child - 1]))
     for row, turned in enumerate(turns):
         states[:, row, packed.ORIENTATION] = turned.as_quat(scalar_first=True)
-        spin = (turned[1:] * turned[:-1].inv()).as_rotvec() / scene.dt
-        states[:, row, packed.ANGULAR_VELOCITY] = np.concatenate([spin, spin[-1:]])
     states[:, 0, packed.POSITION] = place
     states[:, 0, packed.VELOCITY] = np.gradient(place, scene.dt, axis=0)
-    states = closed(scene, states)
+    states = closed(scene, spinning(states, scene.dt))
 
     seen = np.nan_to_num(keypoints.places)
     found = lifted.camera.project(figure.all_points(lifted.pose, lifted.proportions))
-    apart = np.linalg.norm(found - seen, axis=-1) / (PIXELS * max(keypoints.size or 2.0 * lifted.camera.centre))
+    apart = np.linalg.norm(found - seen, axis=-1) / noise(keypoints, lifted.camera)
     trusted = keypoints.confidence / (1.0 + (apart / OUTLIER) ** 2) ** 2
     nearest = np.minimum(np.rint(times * keypoints.rate).astype(int), len(keypoints) - 1)
     both = np.where(keypoints.seen[..., None], seen, found).reshape(len(begin), -1)

@@ -191,11 +191,19 @@ def _wanted(scene: Scene, clip: Motion) -> tuple[np.ndarray, np.ndarray]:
     for axis in (0, 1):
         states[:, rows, axis] += np.interp(np.arange(len(poses)) * scene.dt, times, way[:, axis])[:, None]
     states[:, rows, packed.VELOCITY] = np.gradient(states[:, rows, packed.POSITION], scene.dt, axis=0)
-    for row in range(rows.start, rows.stop):
-        turned = Rotation.from_quat(states[:, row, packed.ORIENTATION], scalar_first=True)
-        states[:-1, row, packed.ANGULAR_VELOCITY] = (turned[1:] * turned[:-1].inv()).as_rotvec() / scene.dt
+    states[:, rows] = spinning(states[:, rows], scene.dt)
     states[:, -1, packed.POSITION] = (-50.0, 0.0, ball.links[0].radius)
     return states, leading(scene, poses)
+
+
+def spinning(states: np.ndarray, dt: float) -> np.ndarray:
+    """The states (T, L, 13), with the angular velocities that take each link from one step to the next."""
+    spun = states.copy()
+    for row in range(states.shape[1]):
+        turned = Rotation.from_quat(states[:, row, packed.ORIENTATION], scalar_first=True)
+        spin = (turned[1:] * turned[:-1].inv()).as_rotvec() / dt
+        spun[:, row, packed.ANGULAR_VELOCITY] = np.concatenate([spin, spin[-1:]])
+    return spun
 
 
 def leading(scene: Scene, poses: np.ndarray) -> np.ndarray:
