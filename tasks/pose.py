@@ -133,13 +133,15 @@ def reconstruct(
     body = simulated(figure, lifted.proportions, MANIFEST)
     scene = Scene((body,), dt=DT)
     model: Dynamics
+    truth: Dynamics | None = None
     if dynamics == "larp":
-        model = Simulator(*stored.load(MANIFEST, scene)[:2])
+        model, truth = Simulator(*stored.load(MANIFEST, scene)[:2]), MujocoDynamics(Truth(scene, 1, SUBSTEPS))
     else:
         model = MujocoDynamics(Truth(scene, ROWS, SUBSTEPS))
     wanted = physical.wanted_of(scene, figure, lifted, film)
     points = physical.Seen(body, figure, lifted.proportions)
-    planner = physical.planner_of(scene, points, lifted.camera, lift.noise(film, lifted.camera), model, preset)
+    sigma = lift.noise(film, lifted.camera)
+    planner = physical.planner_of(scene, points, lifted.camera, sigma, model, preset, truth)
     spent, counted, saved = Spent() if kept is None else kept.spent, 0, time.monotonic()
 
     def observe(execution: Execution) -> None:
@@ -274,6 +276,7 @@ def main(
         "compile_seconds": made.spent.compile_seconds,
         "candidates": made.spent.candidates,
         "candidates_lost": made.spent.lost,
+        "truth_rollouts": made.spent.verified,
         "dynamics": dynamics,
         "preset": preset,
         "seed": seed,

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from larp_model.bodies import human_and_ball
+from larp_model.truth.mujoco import Truth
+from mpc import MujocoDynamics, Verified
 from mpc.gauss_newton import FACTORS
 from tasks import pose
 from tasks.benchmarks import pose as benchmark
@@ -52,6 +54,7 @@ def test_a_film_becomes_a_motion_in_mujoco_and_a_reference(film: dict[str, Any],
     summary = json.loads((out / "summary.json").read_text())
     assert not summary["camera_seems_to_move"] and summary["slip_m_s"] < pose.SLIPPING
     assert not summary["fell"] and summary["error_px"] < 25.0 and summary["candidates"] > 100
+    assert summary["preset"] == "fast" and summary["truth_rollouts"] == 0
     assert summary["height_m"] == pytest.approx(1.75, abs=0.15)
     assert (out / "pose.png").read_bytes().startswith(b"\x89PNG")
     motion = angles.load(out / "pose.npz")
@@ -175,6 +178,14 @@ def test_the_benchmark_tells_how_far_a_reconstruction_is_from_what_was_filmed(tm
     )
     assert 1.0 < row["kinematic"]["mpjpe_pa_mm"] < 100.0
     assert path.with_suffix(".png").is_file()
+
+
+def test_plans_of_a_learned_model_alone_are_tried_in_the_truth() -> None:
+    preset, truth = physical.PRESETS["accurate"], MujocoDynamics(Truth(human_and_ball(), 1))
+    steps, trials = preset.optimizers(truth)
+    assert steps == preset.steps and isinstance(trials, Verified) and trials.dynamics is truth
+    assert preset.optimizers(None) == (preset.steps,)
+    assert physical.PRESETS["balanced"].optimizers(truth) == (physical.PRESETS["balanced"].steps,)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5])

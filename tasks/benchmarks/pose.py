@@ -272,7 +272,7 @@ def main(
     report.write_json(json, content)
     report.write_picture(json.with_suffix(".png"), picture(rows, ways))
     beside = {} if aist is None else {who: dict(zip(TOLD, each, strict=False)) for who, each in PAPER.items()}
-    title = f"Motion from keypoints, {len(rows)} films"
+    title = f"Motion from keypoints, {preset}, {len(rows)} films"
     if beside:
         title += " of AIST++, beside the paper's figures, of videos that it does not name"
     table = Table("measure", *ways, *beside, title=title)
@@ -285,7 +285,8 @@ def main(
         table.add_row("foot skate of what was filmed", f"{np.mean(skates):.3g} %")
     report.show(table)
     if publish:
-        report.publish("pose" if aist is None else "pose-aist", title, command, table)
+        section = ["pose", *(["aist"] if aist else []), *([] if preset == "balanced" else [preset])]
+        report.publish("-".join(section), title, command, table)
 
 
 if __name__ == "__main__":

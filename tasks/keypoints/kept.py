@@ -19,12 +19,16 @@ from tasks.keypoints.lift import Lifted
 
 
 class Spent(NamedTuple):
-    """What planning has taken: seconds, those of compiling apart, candidates, and how many of them were lost."""
+    """What planning has taken: seconds, those of compiling apart, candidates, how many of them were lost.
+
+    verified: candidates that were tried in the truth, too.
+    """
 
     seconds: float = 0.0
     compile_seconds: float = 0.0
     candidates: int = 0
     lost: int = 0
+    verified: int = 0
 
     def and_by(self, info: PlanInfo) -> Spent:
         """With another planning step."""
@@ -34,6 +38,7 @@ class Spent(NamedTuple):
             self.compile_seconds + info.compile_seconds,
             self.candidates + info.candidates,
             self.lost + lost,
+            self.verified + info.verified,
         )
 
 
@@ -86,8 +91,8 @@ class Kept:
         focal, *rest = of("camera", ("focal", "centre", "turn", "position"))
         camera = Camera(float(focal), *rest)
         self.lifted = Lifted(Pose(*of("pose", Pose._fields)), found["proportions"], camera, float(found["error"]))
-        seconds, compiling, candidates, lost = found["spent"].tolist()
-        self.spent = Spent(seconds, compiling, int(candidates), int(lost))
+        seconds, compiling, *counts = found["spent"].tolist()
+        self.spent = Spent(seconds, compiling, *map(int, counts))
         if "states" in found:
             elites, spread, start, key = of("plan", Plan._fields)
             plan = Plan(elites, spread, np.float32(start), key)

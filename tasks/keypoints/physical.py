@@ -15,6 +15,7 @@ or MuJoCo; what comes out is what MuJoCo did.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -27,7 +28,7 @@ from larp_model import state as packed
 from larp_model.rotation import matrix
 from larp_model.scene import Body, Scene, anchor
 from larp_model.truth.mujoco import Truth, closed
-from mpc import CostTerm, Dynamics, GaussNewton, Planner, quadratic
+from mpc import CostTerm, Dynamics, GaussNewton, Optimizer, Planner, Verified, quadratic
 from mpc.loop import Begun, Execution, Phase, Window, execute
 from tasks.data import stray
 from tasks.keypoints.camera import Camera
@@ -45,19 +46,29 @@ NEAR, PACE, STILL = 0.05, 0.5, 0.3
 
 
 class Preset(NamedTuple):
-    """How much a fit may cost: steps that a plan looks ahead and its knots, how it is found, steps between plans."""
+    """How much a fit may cost: steps that a plan looks ahead and its knots, how it is found, steps between plans.
+
+    verify: rounds of trials in the truth of each plan that a learned model finds, which correct it.
+    """
 
     horizon: int
     knots: int
     steps: GaussNewton
     every: int = 5
+    verify: int = 0
+
+    def optimizers(self, truth: Dynamics | None) -> tuple[Optimizer, ...]:
+        """Of a plan; truth: what a model's plans are tried in, if it is not the truth itself."""
+        if truth is None or not self.verify:
+            return (self.steps,)
+        return self.steps, Verified(truth, replace(self.steps, rounds=1), self.verify, candidates=1)
 
 
 # Who looks only half a second ahead sees too late that a start leans too far, and falls.
 PRESETS: dict[PresetName, Preset] = {
     "fast": Preset(80, 11, GaussNewton(rounds=2, directions=48)),
     "balanced": Preset(80, 17, GaussNewton(rounds=4, directions=64)),
-    "accurate": Preset(80, 17, GaussNewton(rounds=8, directions=64)),
+    "accurate": Preset(80, 17, GaussNewton(rounds=2, directions=64), verify=6),
 }
 
 
@@ -173,12 +184,15 @@ def terms_of(seen: Seen, camera: Camera, sigma: float, dt: float) -> tuple[CostT
     )
 
 
-def planner_of(scene: Scene, seen: Seen, camera: Camera, sigma: float, dynamics: Dynamics, preset: Preset) -> Planner:
-    """A planner of these costs; sigma: standard deviation of the keypoints [px]."""
+def planner_of(
+    scene: Scene, seen: Seen, camera: Camera, sigma: float, dynamics: Dynamics, preset: Preset,
+    truth: Dynamics | None = None,
+) -> Planner:  # fmt: skip
+    """A planner of these costs; sigma: standard deviation of the keypoints [px]. truth: see `Preset.optimizers`."""
     bounds = np.array([(motor.lower, motor.upper) for motor in scene.motors])
     return Planner(
         dynamics, terms_of(seen, camera, sigma, scene.dt), preset.horizon, preset.knots, scene.dt,
-        SEARCH * stray(scene), preset.steps, bounds[:, 0], bounds[:, 1],
+        SEARCH * stray(scene), preset.optimizers(truth), bounds[:, 0], bounds[:, 1],
     )  # fmt: skip
 
 
