@@ -201,7 +201,9 @@ def picture(rows: list[dict[str, Any]], ways: Sequence[Way]) -> Figure:
             each.scatter(place + np.linspace(-0.15, 0.15, len(values)), values, s=22, color=COLORS[way])
             each.plot([place - 0.3, place + 0.3], 2 * [np.mean(values)], color=COLORS[way], lw=2)
         each.set(title=TOLD[name][0], xticks=range(len(ways)), xlim=(-0.6, len(ways) - 0.4), yscale="log")
-        each.set_xticklabels(ways)
+        each.set_xticklabels([way.replace("_", "\n") for way in ways])
+        each.yaxis.set_major_formatter("{x:g}")
+        each.yaxis.set_minor_formatter("{x:g}")
     axes[0].set_ylabel("error of a film's joints [mm]; line: mean")
     return figure
 
