@@ -274,7 +274,7 @@ def main(
     report.write_json(json, content)
     report.write_picture(json.with_suffix(".png"), picture(rows, ways))
     beside = {} if aist is None else {who: dict(zip(TOLD, each, strict=False)) for who, each in PAPER.items()}
-    title = f"Motion from keypoints, {preset}, {len(rows)} films"
+    title = f"Motion from keypoints, {preset}, {len(rows)} film{'' if len(rows) == 1 else 's'}"
     if beside:
         title += " of AIST++, beside the paper's figures, of videos that it does not name"
     table = Table("measure", *ways, *beside, title=title)
