@@ -176,7 +176,7 @@ def _residuals(
     points, found = moved(body, camera, turn, change, shared)
     image = jnp.sqrt(weights)[:, None] * (found - places) / (3.0 * sigma)
     sunk = jnp.minimum(points[jnp.array(FEET), 2], 0.0) / SUNK
-    return jnp.concatenate([image.ravel(), *within(body, turn, change), sunk])
+    return jnp.concatenate([image.ravel(), within(body, turn, change), sunk])
 
 
 def _improved(

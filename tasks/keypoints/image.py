@@ -6,7 +6,6 @@ higher, as a logarithm, and how high what a detector takes for heels and for toe
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -38,15 +37,3 @@ def moved(body: Figure, camera: Camera, turn: Array, change: Array, shared: Arra
     turned = matrix(from_rotation_vector(change[3:6])) @ turn
     points = body.points(change[:3], turned, change[6:].reshape(-1, 3), shared[:SHARED])
     return points, tilted(camera, shared[SHARED : SHARED + 3]).project(points)
-
-
-def _slopes(body: Figure, camera: Camera, turn: Array, change: Array, shared: Array) -> tuple[Array, ...]:
-    """Derivatives of `moved` (P, 3, D + S) and (P, 2, D + S), along a change and what is shared."""
-    both = jax.jacfwd(moved, (3, 4))(body, camera, turn, change, shared)
-    return tuple(jnp.concatenate(each, axis=-1) for each in both)
-
-
-# Of many frames at once; cameras are arguments, or each would be compiled anew.
-all_moved, all_slopes = (
-    jax.jit(jax.vmap(each, (None, None, 0, 0, None)), static_argnums=0) for each in (moved, _slopes)
-)

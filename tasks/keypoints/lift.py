@@ -24,14 +24,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from scipy.spatial.transform import Rotation
 
 from tasks.keypoints.alone import Alone
 from tasks.keypoints.banded import Banded
 from tasks.keypoints.camera import Camera
-from tasks.keypoints.figure import SHARED, SOLE, USUAL, Pose, figure
-from tasks.keypoints.image import COMMON, HEIGHT, ROLL, TILT, all_moved, all_slopes, seen_by
-from tasks.keypoints.likely import slopes_of_unlike, unlike
+from tasks.keypoints.figure import SHARED, SOLE, USUAL, Figure, Pose, figure
+from tasks.keypoints.image import COMMON, HEIGHT, ROLL, TILT, moved, seen_by
+from tasks.keypoints.likely import within
 from tasks.keypoints.points import FEET, POINTS, SIDES, Keypoints
 from tasks.keypoints.rows import by_rows, single
 
@@ -79,11 +80,13 @@ class Lifted(NamedTuple):
 
 
 class Now(NamedTuple):
-    """What follows from a pose: points (T, P, 3) [m], places (T, P, 2) [px], how high soles are (T, 4) [m]."""
+    """What follows from a pose: points (T, P, 3) [m], places (T, P, 2) [px], `likely.within` (T, K), and how high soles
+    are (T, 4) [m].
+    """
 
-    pose: Pose
     points: np.ndarray
     places: np.ndarray
+    unlike: np.ndarray
     heights: np.ndarray
 
 
@@ -176,7 +179,7 @@ class _Lifter:
         """The residuals around a pose, their weights as they are there."""
         frames, count, rate = len(pose.place), len(POINTS), self.keypoints.rate
         now = self.now(pose, shared)
-        x, y = self.derivatives(pose, shared)
+        x, y, of_unlike = self.derivatives(pose, shared)
         each = 30.0 / rate  # neighbouring frames of a fast film tell little that is new
         seen = (confidence > 0.0)[..., None]
 
@@ -210,10 +213,7 @@ class _Lifter:
                 each * (stands / LEVEL**2 + (height < 0.0) / SUNK**2), lambda now: now.heights, ((0, of_heights),)
             ),
             self.balance(now, stands, x),
-            Term(
-                np.full((frames, 6 * self.figure.joints + 2), each), lambda now: unlike(self.figure, now.pose),
-                ((0, slopes_of_unlike(self.figure, pose)),),
-            ),
+            Term(np.full(now.unlike.shape, each), lambda now: now.unlike, ((0, of_unlike),)),
         ]  # fmt: skip
 
     def balance(self, now: Now, stands: np.ndarray, x: np.ndarray) -> Term:
@@ -249,21 +249,37 @@ class _Lifter:
 
     def now(self, pose: Pose, shared: np.ndarray) -> Now:
         """What follows from a pose and what is shared."""
-        points, places = self.imaged(all_moved, pose, shared)
-        return Now(pose, points, places, points[:, FEET, 2] - SOLE - np.tile(shared[-2:], 2))
+        points, places, unlike = self.by_frames(_all_followed, pose, shared)
+        return Now(points, places, unlike, points[:, FEET, 2] - SOLE - np.tile(shared[-2:], 2))
 
-    def derivatives(self, pose: Pose, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of points (T, 3 P, D + S) and of their places (T, 2 P, D + S), along changes and what is shared."""
-        points, places = self.imaged(all_slopes, pose, shared)
-        frames, _, _, count = points.shape
-        return points.reshape(frames, -1, count), places.reshape(frames, -1, count)
+    def derivatives(self, pose: Pose, shared: np.ndarray) -> list[np.ndarray]:
+        """Of points (T, 3 P, D + S), places (T, 2 P, D + S) and `likely.within` (T, K, D + S), by pose and shared."""
+        found = self.by_frames(_all_slopes, pose, shared)
+        return [each.reshape(len(each), -1, each.shape[-1]) for each in found]
 
-    def imaged(self, function: Callable[..., Any], pose: Pose, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """`image.all_moved` or `image.all_slopes` of all frames."""
+    def by_frames(self, function: Callable[..., Any], pose: Pose, shared: np.ndarray) -> Any:
+        """`_followed` or `_slopes` of all frames."""
         still = np.zeros_like(pose.place)
         change = np.concatenate([pose.place, still, pose.angles.reshape(len(pose.place), -1)], axis=1)
         camera, common = single((self.camera, shared))
         return by_rows(lambda turn, change: function(self.figure, camera, turn, change, common), pose.turn, change)
+
+
+def _followed(body: Figure, camera: Camera, turn: Array, change: Array, shared: Array) -> tuple[Array, ...]:
+    """Points (P, 3) [m] of one frame, their places (P, 2) [px], and how unlike people's its pose is (K,)."""
+    return *moved(body, camera, turn, change, shared), within(body, turn, change)
+
+
+def _slopes(body: Figure, camera: Camera, turn: Array, change: Array, shared: Array) -> tuple[Array, ...]:
+    """Derivatives of `_followed`, along a change and what is shared (D + S,), on their last axis."""
+    both = jax.jacfwd(_followed, (3, 4))(body, camera, turn, change, shared)
+    return tuple(jnp.concatenate(each, axis=-1) for each in both)
+
+
+# Of many frames at once; cameras are arguments, or each would be compiled anew.
+_all_followed, _all_slopes = (
+    jax.jit(jax.vmap(each, (None, None, 0, 0, None)), static_argnums=0) for each in (_followed, _slopes)
+)
 
 
 def noise(keypoints: Keypoints, camera: Camera) -> float:

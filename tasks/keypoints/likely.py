@@ -9,8 +9,7 @@ import numpy as np
 from jax import Array
 
 from larp_model.rotation import from_rotation_vector, matrix
-from tasks.keypoints.figure import Figure, Pose, figure
-from tasks.keypoints.image import COMMON
+from tasks.keypoints.figure import Figure, figure
 from tasks.motions import styles
 
 # Standard deviations: of angles beyond a joint's limits [rad]; of a trunk's lean [rad].
@@ -43,35 +42,12 @@ def usual_poses() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return mean, whitening, np.reshape(chosen, (POSES, -1, 3))
 
 
-def within(body: Figure, turn: Array, change: Array) -> list[Array]:
-    """Of one pose, its turn (3, 3) and change (D,): see `image.moved`."""
+def within(body: Figure, turn: Array, change: Array) -> Array:
+    """Of one pose (K,), its turn (3, 3) and change (D,): see `image.moved`."""
     mean, whitening, _ = usual_poses()
     angles = change[6:]
     lower, upper = (jnp.asarray(each.ravel(), change.dtype) for each in (body.lower, body.upper))
     beyond = (jnp.minimum(angles - lower, 0.0) + jnp.maximum(angles - upper, 0.0)) / BEYOND
     unusual = jnp.asarray(whitening, change.dtype) @ (angles - jnp.asarray(mean, change.dtype))
     upright = (matrix(from_rotation_vector(change[3:6])) @ turn)[:2, 2] / LEAN
-    return [beyond, unusual, upright]
-
-
-def unlike(body: Figure, pose: Pose) -> np.ndarray:
-    """`within` of all frames (T, K)."""
-    mean, whitening, _ = usual_poses()
-    angles = pose.angles.reshape(len(pose.place), -1)
-    lower, upper = body.lower.ravel(), body.upper.ravel()
-    beyond = np.minimum(angles - lower, 0.0) + np.maximum(angles - upper, 0.0)
-    unusual = (angles - mean) @ whitening.T
-    return np.concatenate([beyond / BEYOND, unusual, pose.turn[:, :2, 2] / LEAN], axis=1)
-
-
-def slopes_of_unlike(body: Figure, pose: Pose) -> np.ndarray:
-    """Derivatives (T, K, D + S) of `unlike`."""
-    frames, count = len(pose.place), 3 * body.joints
-    slopes = np.zeros((frames, 2 * count + 2, 6 + count + COMMON))
-    rows = np.arange(count)
-    slopes[:, rows, 6 + rows] = (unlike(body, pose)[:, :count] != 0.0) / BEYOND
-    slopes[:, count : 2 * count, 6 : 6 + count] = usual_poses()[1]
-    axis = pose.turn[:, :, 2]  # which a turn d moves by d x axis
-    slopes[:, 2 * count, 4], slopes[:, 2 * count, 5] = axis[:, 2] / LEAN, -axis[:, 1] / LEAN
-    slopes[:, 2 * count + 1, 3], slopes[:, 2 * count + 1, 5] = -axis[:, 2] / LEAN, axis[:, 0] / LEAN
-    return slopes
+    return jnp.concatenate([beyond, unusual, upright])
