@@ -115,6 +115,13 @@ class Reconstruction(NamedTuple):
         return bool((self.states[:, 0, 2] < 0.5 * standing_height(self.body)).any())
 
 
+def at_frames(points: np.ndarray, dt: float, film: Keypoints) -> np.ndarray:
+    """Points (N, P, 3) of every step of so many seconds at a film's frames, in between linearly."""
+    at, steps = np.arange(len(film)) / film.rate, np.arange(len(points)) * dt
+    found = [np.interp(at, steps, each) for each in points.reshape(len(points), -1).T]
+    return np.stack(found, axis=1).reshape(len(film), *points.shape[1:])
+
+
 def reconstruct(
     film: Keypoints,
     lifted: lift.Lifted,
@@ -157,11 +164,10 @@ def reconstruct(
     begun, state = None if kept is None else kept.begun, physical.started(scene, wanted)
     execution = physical.fit(scene, planner, wanted, state, preset.every, seed, observe, begun)
     states = np.stack(execution.states)
-    frames = np.minimum(np.rint(np.arange(len(film)) / film.rate / scene.dt).astype(int), len(states) - 1)
+    executed = np.asarray(points.points(states.astype(np.float32)), float)
     return Reconstruction(
         lifted, body, figure.all_points(lifted.pose, lifted.proportions),
-        np.asarray(points.points(states[frames].astype(np.float32)), float), wanted, states,
-        spent,
+        at_frames(executed, scene.dt, film), wanted, states, spent,
     )  # fmt: skip
 
 

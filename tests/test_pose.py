@@ -142,6 +142,15 @@ def test_frames_at_the_ends_in_which_nobody_is_seen_are_left_out(film: dict[str,
     np.testing.assert_array_equal(left.places[-1], whole.places[len(whole) - 6])
 
 
+def test_who_moves_steadily_does_so_in_every_frame_too_whatever_the_film_s_rate() -> None:
+    frames, velocity = 60, np.array([1.0, -0.5, 0.25])
+    film = Keypoints(np.zeros((frames, len(POINTS), 2)), np.ones((frames, len(POINTS))), 60.0, (100.0, 100.0))
+    executed = np.arange(99)[:, None, None] * 0.01 * np.broadcast_to(velocity, (len(POINTS), 3))
+    found = pose.at_frames(executed, 0.01, film)
+    np.testing.assert_allclose(60.0 * np.diff(found[:-1], axis=0), np.broadcast_to(velocity, found[1:-1].shape))
+    np.testing.assert_array_equal(found[-1], executed[-1])
+
+
 @pytest.mark.parametrize(
     ("changed", "arguments", "said"),
     [
