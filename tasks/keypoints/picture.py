@@ -38,8 +38,9 @@ def pose_picture(keypoints: Keypoints, camera: Camera, found: np.ndarray, start:
     drawing = Figure(figsize=(14.0, 6.2), layout="constrained")
     axes = drawing.subplots(2, FRAMES)
     images = [camera.project(found), camera.project(start), keypoints.places]
-    flat = np.concatenate([each[keypoints.seen] for each in images])
-    low, high = np.nanpercentile(flat, 1, axis=0) - 40.0, np.nanpercentile(flat, 99, axis=0) + 40.0
+    figures = np.concatenate(images[:2], axis=1)  # keypoints may be anywhere
+    low, high = figures.min(axis=1), figures.max(axis=1)
+    reach = 0.5 * (high - low).max(axis=0) + 40.0
     ahead = camera.turn[2] * (1.0, 1.0, 0.0)
     ahead = ahead / np.linalg.norm(ahead)
     sides = [each @ np.stack([ahead, (0.0, 0.0, 1.0)]).T for each in (found, start)]
@@ -49,7 +50,8 @@ def pose_picture(keypoints: Keypoints, camera: Camera, found: np.ndarray, start:
         _bones(above, images[1][frame], KINEMATIC)
         _bones(above, images[0][frame], PHYSICAL)
         above.scatter(*keypoints.places[frame].T, s=12, color=SEEN, zorder=3)
-        above.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), aspect="equal", xticks=[], yticks=[])
+        (left, top), (right, bottom) = (0.5 * (low + high)[frame] + side * reach for side in (-1.0, 1.0))
+        above.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
         _bones(below, sides[1][frame], KINEMATIC)
         _bones(below, sides[0][frame], PHYSICAL)
         middle = sides[0][frame, :, 0].mean()
