@@ -30,7 +30,7 @@ from tasks.motions.references import embedded, motion_of
 from tasks.pose import reconstruct, shown
 from tasks.presets import PresetName
 
-# Frames a second of a film, and of it what lies before a kick's strike, as a share.
+# Frames a second of a synthetic film, and of it what lies before a kick's strike, as a share.
 RATE, BEFORE = 60.0, 0.63
 Way = Literal["kinematic", "larp", "mujoco", "mujoco_timed"]
 WAYS: tuple[Way, ...] = ("kinematic", "larp", "mujoco")
@@ -113,7 +113,7 @@ def of_dance(folder: Path, sequence: str, camera: int, seconds: float) -> Film:
     """The first seconds of a dance of AIST++, seen by one of its cameras."""
     name = dances.video(sequence, camera)
     keypoints, lens, true = dances.load(folder, sequence, camera)
-    begun = keypoints.cut(0, round(seconds * RATE) - 1)
+    begun = keypoints.cut(0, round(seconds * keypoints.rate) - 1)
     try:
         first, last = shown(begun)
     except ValueError as error:
@@ -158,7 +158,7 @@ def measured(film: Callable[[], Film], ways: Sequence[Way], preset: physical.Pre
     def judged(points: np.ndarray) -> dict[str, float]:
         return metrics.position_errors(points, true) | metrics.off_the_ground(points) | {
             "mpjpe_2d_px": metrics.pixel_error(lens.project(points), lens.project(true)),
-            "velocity": metrics.velocity_error(points, true, RATE),
+            "velocity": metrics.velocity_error(points, true, keypoints.rate),
             "foot_skate": metrics.foot_skate(points),
         }  # fmt: skip
 
@@ -228,7 +228,7 @@ def main(
         sequences: of aist, by its names (gBR_sBM_cAll_d06_mBR4_ch06) or those of videos (gBR_sBM_c06_d06_mBR4_ch06,
             camera 6 alone); 15 videos that others take by default, as far as the folder has them, else all that it has.
         cameras: that see each of them, somewhere around it; of aist, the first.
-        seconds: of each film, at 60 frames a second; of aist, the first.
+        seconds: of each film, of 60 frames each; of aist, the first.
         ways: the kinematic start alone, or followed by a planner whose model is larp or mujoco, with as many candidates
             each; mujoco_timed has so few that it takes about larp's time, and comes after both.
         preset: how much a plan may cost.
