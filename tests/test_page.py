@@ -253,8 +253,8 @@ def test_the_next_plan_is_by_what_is_chosen_from_a_list(
 def test_the_next_plan_tries_as_much_as_fits_into_the_seconds_that_are_set(seen: Page, served: Served) -> None:
     seen.get_by_role("tab", name="Kick").click()
     usual = served.live.planners(planned_for(served))
-    enter(seen, "Budget [s]", "2")
-    until(lambda: planned_for(served).budget == 2.0, 120.0)
+    enter(seen, "Budget [s]", "5")
+    until(lambda: planned_for(served).budget == 5.0, 240.0)
     (search,), (few,) = served.live.planners(planned_for(served)).first.optimizers, usual.first.optimizers
     assert (
         isinstance(search, CEM) and isinstance(few, CEM) and search.samples * search.rounds > few.samples * few.rounds
@@ -369,7 +369,7 @@ def test_ghosts_are_seen_only_if_wished_for(ghost: str, played: Page, served: Se
 @pytest.mark.parametrize(("kind", "begins"), [("html", b"<!do"), ("png", b"\x89PNG"), ("gif", b"GIF8")])
 def test_what_is_played_can_be_downloaded(kind: str, begins: bytes, played: Page, tmp_path: Path) -> None:
     button = unfolded(played, kind)
-    with played.expect_download(timeout=120_000) as begun:
+    with played.expect_download(timeout=300_000) as begun:
         button.click()
     begun.value.save_as(tmp_path / "file")
     assert (tmp_path / "file").read_bytes()[:4] == begins

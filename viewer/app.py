@@ -457,7 +457,9 @@ class LivePage:
 
         def make() -> None:
             try:
-                client.send_file_download(*files(kind, recording), save_immediately=True)
+                name, content = files(kind, recording)
+                if client.client_id in self._server.get_clients():  # it may have left meanwhile
+                    client.send_file_download(name, content, save_immediately=True)
             finally:
                 self._filing.release()
 
