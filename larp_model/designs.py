@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+from larp_model.mechanics import Constants
 from larp_model.networks import Size
 from larp_model.parts.articulated import Articulated, Base, Response
 from larp_model.parts.bases import FromNothing, OverMechanics
@@ -61,7 +62,7 @@ def hybrid(scene: Scene, sizes: Sizes = SIZES["small"]) -> Model:
     # A body's own links press on each other for longer than an impact: with fading, legs slip further through. What a
     # network learned there was no better than mechanics for the lean human, and worse for the full one.
     between, within = (SoftContacts(Rule(fades=FADES)), sizes.contact), (SoftContacts(), None)
-    return _impulsive(scene, sizes, OverMechanics(lasting=True), between, within, sliding=True)
+    return _impulsive(scene, sizes, OverMechanics(Constants(rounds=3), lasting=True), between, within, sliding=True)
 
 
 def paper(scene: Scene, sizes: Sizes = PAPER) -> Model:

@@ -40,12 +40,16 @@ class Constants:
     closing: share of a joint's displacement that a step takes back (J. Baumgarte, Computer Methods 1 (1972)). standing,
     sliding: an end that stands on the ground is held as if by so many times its body's mass, one that slides by so
     many: held harder, a direction of sliding that is half a step old throws the body. held: see `compliance.HELD`.
+    rounds: Newton steps in which the ground's forces are found, all of them at once, and what slides is held like what
+    stands (`reaction`). 0: which end stands, slides or lifts is decided beforehand, each as if its link were free
+    (`ground`): quicker, and three times further from the truth after 0.1 s of motion and more.
     """
 
     closing: float = 0.2
     standing: float = 8.0
     sliding: float = 0.2
     held: float = HELD
+    rounds: int = 0
 
 
 class Motion(NamedTuple):
@@ -131,14 +135,32 @@ def free_motion(
         tied = turned_anchors(body, local, matrices)
         before = turns(start)
         pull, hold = servos(body, start, before, targets, spin, h, stronger)
-        bearing = ground(body, before, position[:, 2:] + raised, velocity, spin, sizes, gravity, h, constants)
-        inertia, push = jax.tree.map(jnp.add, (inertia, push), bearing)
-        inertia, push, tied, pull, hold = held((inertia, push, tied, pull, hold))
+        height = position[:, 2:] + raised
+        tied, pull, hold = held((tied, pull, hold))
         levels = [
             Level(rows, parents, *(each[rows - 1] for each in (*tied, constants.closing / dt * gap, pull, hold)))
             for rows, parents in tree(body)
         ]
-        return solve(inertia, push, levels)
+
+        def parting(bearing: tuple[Inertia, Push]) -> tuple[Array, Array]:
+            """Velocities and spins under what the ground adds to inertia and push."""
+            bears, pushed = held(jax.tree.map(jnp.add, (inertia, push), bearing))
+            return solve(bears, pushed, levels)
+
+        if not constants.rounds:
+            return parting(ground(body, before, height, velocity, spin, sizes, gravity, h, constants))
+        ends = Ends.of(body, before, height, velocity, spin, sizes, h)
+        firm = constants.standing * jnp.sum(mass, axis=0, keepdims=True)
+
+        def round_of(guess: tuple[Array, Array, Array], nothing: None) -> tuple[tuple[Array, Array, Array], None]:
+            velocity, spin, met = guess
+            found = ends.velocity(velocity, spin)
+            met = jnp.maximum(met, decided(-ends.clearance - h * found[:, 2:], 1e-5))
+            return (*parting(ends.bearing(found, met, firm, body.surface.friction)), met), None
+
+        falls = velocity + h * down, spin, jnp.zeros_like(ends.clearance)
+        (velocity, spin, _), _ = jax.lax.scan(round_of, falls, length=constants.rounds)
+        return velocity, spin
 
     ratio = (1.0 - GAMMA) / GAMMA
 
@@ -456,6 +478,74 @@ def ground(
     down = radius * upright
     added: tuple[Inertia, Push] = jax.tree.map(jnp.add, end(half - down), end(-half - down))
     return added
+
+
+class Ends(NamedTuple):
+    """Both ends of all links, (2 n, ..., B), one end of each after the other, and how the ground wants them to move.
+
+    arm: their lowest points [m] from the links' centres. clearance: their height [m]. allowed: the velocity [m/s] at
+    which neither the spring of the body's surface nor friction pushes them.
+    """
+
+    arm: Array
+    clearance: Array
+    allowed: Array
+
+    @staticmethod
+    def of(body: Body, matrices: Array, height: Array, velocity: Array, spin: Array, sizes: Array, h: float) -> Ends:
+        """Of links that are so turned (n, 3, 3, B), so high (n, 1, B) [m] and so fast at first (n, 3, B)."""
+        surface, upright = body.surface, jnp.array([0.0, 0.0, 1.0], matrices.dtype)[:, None]
+        axes = jnp.array([link.axis for link in body.links], matrices.dtype)[..., None]
+        half, down = 0.5 * sizes[:, :1] * mv(matrices, axes), sizes[:, 1:2] * upright
+        arm = jnp.concatenate([half - down, -half - down])
+        speed, clearance = twice(velocity) + cross(twice(spin), arm), twice(height) + arm[:, 2:]
+        damped = 1.0 + h * surface.damping
+        rising = (speed[:, 2:] - h * surface.stiffness * clearance) / (damped + h**2 * surface.stiffness)
+        return Ends(arm, clearance, speed * (1.0 - upright) / damped + rising * upright)
+
+    def velocity(self, velocity: Array, spin: Array) -> Array:
+        """The ends' velocities (2 n, 3, B), from the links'."""
+        return twice(velocity) + cross(twice(spin), self.arm)
+
+    def bearing(self, guess: Array, met: Array, firm: Array, friction: float) -> tuple[Inertia, Push]:
+        """What the ends add to their links' inertia and push: the ground's impulses, linear around velocities `guess`.
+
+        met (2 n, 1, B): 1 where an end is in the ground. firm (1, 1, B) [kg]: see `reaction`.
+        """
+        impulse, slope = reaction(firm * (self.allowed - guess), friction)
+        hold = held(met[:, None] * firm[:, None] * slope)
+        push, mixed = met * impulse + mv(hold, guess), cross_columns(self.arm, hold)
+        added = Inertia(-cross_rows(mixed, self.arm), mixed, hold), Push(cross(self.arm, push), push)
+        links = len(self.arm) // 2
+        both: tuple[Inertia, Push] = jax.tree.map(lambda each: each[:links] + each[links:], added)
+        return both
+
+
+def reaction(asked: Array, friction: float) -> tuple[Array, Array]:
+    """Impulses (n, 3, B) in the friction cone that are nearest to those asked for, and their slopes (n, 3, 3, B).
+
+    MuJoCo's soft contact: the impulse J on a point whose velocity is v' minimises the kinetic energy together with the
+    squared distance of what is asked, r (v - v') with the mass r that holds the point and the velocity v that the
+    ground allows, from the polar cone, so that J is its projection onto the cone (E. Todorov, "Convex and analytically
+    invertible dynamics with contacts and constraints", 2014). The slopes are symmetric and not negative.
+    """
+    upright = jnp.array([0.0, 0.0, 1.0], asked.dtype)[:, None]
+    unit = jnp.eye(3, dtype=asked.dtype)[..., None]
+    pressing, sideways = asked[:, 2:], asked * (1.0 - upright)
+    pull = jnp.sqrt(jnp.sum(sideways**2, axis=1, keepdims=True) + 1e-12)
+    along = upright + friction * sideways / pull
+    share = (pressing + friction * pull) / (1.0 + friction**2)
+    across = unit - upright[:, None] * upright - (sideways / pull)[:, :, None] * (sideways / pull)[:, None]
+    bent = jnp.clip(friction * share / pull, 0.0, 1.0)
+    sliding = along[:, :, None] * along[:, None] / (1.0 + friction**2) + bent[:, None] * across
+    stands, pushed = held((pull <= friction * pressing, friction * pull > -pressing))  # see `decided`
+    impulse = jnp.where(stands, asked, share * along) * pushed
+    return impulse, jnp.where(stands[:, None], unit, sliding) * pushed[:, None]
+
+
+def twice(links: Array) -> Array:
+    """Of both ends of every link."""
+    return jnp.concatenate([links, links])
 
 
 def decided(value: Array, width: float) -> Array:

@@ -38,13 +38,13 @@ from tasks.keypoints.points import Keypoints
 from tasks.models import ROWS, DynamicsName
 from tasks.motions import angles, bvh
 from tasks.presets import PresetName
-from tasks.scenarios import ANY_HUMAN
+from tasks.scenarios import ANY_HUMAN_ALONE
 from viewer import Overlay, write_overlay
 
 # Of states and controls [s], as every scene's by default.
 DT = 0.01
 # Of the learned model, whatever a film shows.
-MANIFEST = stored.SHIPPED / f"{ANY_HUMAN['lean']}.json"
+MANIFEST = stored.SHIPPED / f"{ANY_HUMAN_ALONE}.json"
 # Keypoints are shown so far before the points they belong to [m], or these would hide them.
 BEFORE = 0.2
 # What is done is kept every so many seconds.

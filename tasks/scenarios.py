@@ -21,6 +21,8 @@ from tasks.thrown import thrown_episodes
 CHAIN_WINDOWS = (10, 40, 80, 190)
 # The scenarios, and the weights, of humans of every size in any motion.
 ANY_HUMAN: dict[Detail, str] = {"lean": "any_human", "full": "full_human"}
+# The same of the lean human with nothing to strike.
+ANY_HUMAN_ALONE = "any_human_alone"
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ def _human(name: str, scene: Scene, *paper: tuple[str, tuple[float, ...]]) -> Sc
 
 
 def _any(name: str, scene: Scene) -> Scenario:
-    return Scenario(name, scene, partial(_any_human, scene), WINDOWS, strikes=True)
+    return Scenario(name, scene, partial(_any_human, scene), WINDOWS, bool(scene.between.pairs))
 
 
 def _thrown(name: str, scene: Scene, *paper: float, varied: bool = True) -> Scenario:
@@ -80,6 +82,7 @@ SCENARIOS = {
         ),
         _human("human", human_and_ball().only("human")),
         _any(ANY_HUMAN["lean"], human_and_ball(self_contact=True)),
+        _any(ANY_HUMAN_ALONE, human_and_ball().only("human")),
         _any(ANY_HUMAN["full"], human_and_ball(detail="full", self_contact=True)),
         _thrown("chain4", Scene((chain(links=4),))),
         _thrown("chains1", two_chains(1), 0.008, 0.021, 0.048, 0.173),

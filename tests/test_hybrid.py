@@ -15,6 +15,7 @@ from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.bodies import capsule, two_chains
 from larp_model.kinematics import kinematics, morphology_of
+from larp_model.mechanics import Constants
 from larp_model.meeting import first_contacts
 from larp_model.parts.articulated import Articulated
 from larp_model.parts.bases import OverMechanics
@@ -106,7 +107,7 @@ def test_a_batch_equals_single_runs(simulator: Simulator, meetings: np.ndarray) 
 def test_what_the_base_is_survives_on_disk(simulator: Simulator, tmp_path: Path) -> None:
     manifest = stored.save(tmp_path, "tiny", MODEL, simulator.weights, {})
     part = stored.load(manifest, SCENE)[0].bodies[0]
-    assert isinstance(part, Articulated) and part.base == OverMechanics(lasting=True)
+    assert isinstance(part, Articulated) and part.base == OverMechanics(Constants(rounds=3), lasting=True)
 
 
 def test_a_push_changes_a_capsule_by_its_mass_from_when_it_acts() -> None:

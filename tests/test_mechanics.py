@@ -11,6 +11,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from jax import Array
 from scipy.spatial.transform import Rotation
 
@@ -18,10 +21,11 @@ from larp_model import kinematics, rotation
 from larp_model import state as packed
 from larp_model.bodies import capsule, chain, human, human_and_ball
 from larp_model.compliance import moments
-from larp_model.mechanics import GAMMA, Constants, Motion, free_motion, impulse_response
+from larp_model.mechanics import GAMMA, Constants, Motion, free_motion, impulse_response, reaction
 from larp_model.scene import Body, Scene
 from larp_model.truth.mujoco import Truth, closed, compile_model
 from tasks.motions.references import standing_on_ground
+from tasks.scenarios import scenario
 from tasks.thrown import thrown_episodes, thrown_starts
 
 BODIES = (capsule(), chain(links=2), chain(links=4), human())
@@ -57,17 +61,18 @@ def starts(body: Body) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def motion_of(
-    body: Body, state: Array, control: Array, torque: Array, gravity: float = 9.81, dt: float = 0.01
+    body: Body, state: Array, control: Array, torque: Array, gravity: float = 9.81, dt: float = 0.01, rounds: int = 0
 ) -> Motion:
     """`free_motion` of the body as it is."""
-    return free_motion(body, state, control, torque, kinematics.morphology_of(Scene((body,)))[None], gravity, dt)
+    sizes, constants = kinematics.morphology_of(Scene((body,)))[None], Constants(rounds=rounds)
+    return free_motion(body, state, control, torque, sizes, gravity, dt, constants)
 
 
 @cache
-def compiled(body: Body) -> Any:
+def compiled(body: Body, rounds: int = 0) -> Any:
     """`motion_of` the body, compiled once for every gravity and step."""
     options = {"xla_backend_optimization_level": 0}
-    found = jax.jit(partial(motion_of, body), compiler_options=options)
+    found = jax.jit(partial(motion_of, body, rounds=rounds), compiler_options=options)
     return lambda *given, gravity=9.81, dt=0.01: found(*given, gravity, dt)
 
 
@@ -209,35 +214,38 @@ def test_impulses_are_answered_as_the_engines_inertia_says(body: Body) -> None:
         np.testing.assert_allclose(found[1][index], expected[:, 3:], atol=1e-5 * scale)
 
 
-def test_a_chain_comes_to_rest_on_the_ground_and_is_given_no_energy() -> None:
+@pytest.mark.parametrize("rounds", [0, 3], ids=["decided", "found"])
+def test_a_chain_comes_to_rest_on_the_ground_and_is_given_no_energy(rounds: int) -> None:
     body = chain(links=4)
     states = thrown_starts(np.random.default_rng(0), Scene((body,)), np.tile(Scene((body,)).morphology, (COUNT, 1, 1)))
     none = np.zeros((COUNT, 0, 3)), np.zeros((COUNT, len(body.links), 3))
     most = energy(body, states)
     for _ in range(300):
-        states = moved(states, compiled(body)(states, *none))
+        states = moved(states, compiled(body, rounds)(states, *none))
         assert (energy(body, states) < most + 0.01 * np.abs(most)).all()
     assert np.abs(states[..., 7:]).max() < 1e-6
     np.testing.assert_allclose(states[..., 2], body.links[0].radius, atol=2e-4)
 
 
-def test_a_standing_human_presses_on_the_ground_as_in_the_truth() -> None:
+@pytest.mark.parametrize("rounds", [0, 3], ids=["decided", "found"])
+def test_a_standing_human_presses_on_the_ground_as_in_the_truth(rounds: int) -> None:
     scene = human_and_ball().only("human")
     body, stand = scene.bodies[0], np.zeros((1, len(scene.motors), 3))
     states = standing_on_ground(scene, stand, Rotation.identity(1))
     true, _ = Truth(scene).rollout(states, np.zeros((1, 20, len(scene.motors), 3)))
     for _ in range(20):
-        states = moved(states, compiled(body)(states, stand, np.zeros((1, len(body.links), 3))))
+        states = moved(states, compiled(body, rounds)(states, stand, np.zeros((1, len(body.links), 3))))
     assert np.abs(states[..., :3] - true[:, -1, :, :3]).max() < 0.01
     assert np.abs(states[..., 7:10] - true[:, -1, :, 7:10]).max() < 0.1
 
 
-def test_stiff_servos_do_not_throw_a_body_in_long_steps() -> None:
+@pytest.mark.parametrize("rounds", [0, 3], ids=["decided", "found"])
+def test_stiff_servos_do_not_throw_a_body_in_long_steps(rounds: int) -> None:
     body = human()
     states, _, torques = starts(body)
     controls = np.zeros((COUNT, len(body.motors), 3))
     for _ in range(40):
-        states = moved(states, compiled(body)(states, controls, 0.0 * torques, dt=0.05))
+        states = moved(states, compiled(body, rounds)(states, controls, 0.0 * torques, dt=0.05))
     assert np.isfinite(states).all() and np.abs(states[..., packed.ANGULAR_VELOCITY]).max() < 30.0
 
 
@@ -258,20 +266,22 @@ def test_forward_reverse_and_finite_difference_gradients_agree() -> None:
     np.testing.assert_allclose((several(given + step) - several(given - step)).T / 2e-6, forward, atol=1e-5)
 
 
-def test_light_links_that_bear_on_the_ground_are_moved_alike_in_32_and_64_bits() -> None:
+@pytest.mark.parametrize("rounds", [0, 3], ids=["decided", "found"])
+def test_light_links_that_bear_on_the_ground_are_moved_alike_in_32_and_64_bits(rounds: int) -> None:
     body = chain(links=4)
     scene, random = Scene((body,)), np.random.default_rng(0)
     states = thrown_starts(random, scene, np.tile(scene.morphology, (COUNT, 1, 1)))
     none = np.zeros((COUNT, 0, 3)), np.zeros((COUNT, 4, 3))
     for _ in range(60):
-        fine = compiled(body)(states, *none)
+        fine = compiled(body, rounds)(states, *none)
         with jax.enable_x64(False):
-            coarse = compiled(body)(*(each.astype(np.float32) for each in (states, *none)))
+            coarse = compiled(body, rounds)(*(each.astype(np.float32) for each in (states, *none)))
         assert np.abs(coarse.velocity - fine.velocity).max() < 5e-3
         states = moved(states, fine)
 
 
-def test_an_end_that_just_touches_the_ground_throws_no_body_however_that_is_rounded() -> None:
+@pytest.mark.parametrize("rounds", [0, 3], ids=["decided", "found"])
+def test_an_end_that_just_touches_the_ground_throws_no_body_however_that_is_rounded(rounds: int) -> None:
     body, rows, h = chain(links=4), 64, GAMMA * 0.01
     scene = Scene((body,))
     episodes, _ = thrown_episodes(scene, rows, seed=7, steps=80)
@@ -287,7 +297,7 @@ def test_an_end_that_just_touches_the_ground_throws_no_body_however_that_is_roun
     shifted[..., 2] += np.tile(np.linspace(-4e-8, 4e-8, 16), rows)[:, None]
     with jax.enable_x64(False):
         given = shifted, np.zeros((len(shifted), 0, 3)), np.zeros((len(shifted), 4, 3))
-        after = jax.jit(partial(motion_of, body))(*(jnp.asarray(each, jnp.float32) for each in given))
+        after = jax.jit(partial(motion_of, body, rounds=rounds))(*(jnp.asarray(each, jnp.float32) for each in given))
     assert (np.linalg.norm(after.velocity - shifted[..., packed.VELOCITY], axis=-1) < 5.0).all()
 
 
@@ -304,3 +314,66 @@ def test_motors_of_other_sizes_pull_as_those_of_a_body_of_that_size() -> None:
     ):
         for a, b in zip(one, two, strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
+
+
+@settings(max_examples=200, deadline=None)
+@given(asked=arrays(np.float64, 3, elements=st.floats(-10.0, 10.0)), friction=st.floats(0.0, 2.0))
+def test_the_ground_gives_of_what_is_asked_the_nearest_that_friction_allows(asked: np.ndarray, friction: float) -> None:
+    given, slope = (np.asarray(each)[0, ..., 0] for each in reaction(jnp.asarray(asked)[None, :, None], friction))
+    assert np.hypot(*given[:2]) <= friction * given[2] + 1e-5
+    others = np.random.default_rng(0).uniform(-20.0, 20.0, (500, 3))
+    others = others[np.hypot(*others[:, :2].T) <= friction * others[:, 2]]
+    assert np.linalg.norm(asked - given) <= np.linalg.norm(asked - others, axis=1).min(initial=np.inf) + 1e-5
+    np.testing.assert_allclose(slope, slope.T, atol=1e-12)
+    least, _, largest = np.linalg.eigvalsh(slope)
+    assert least > -1e-9 and largest < 1.0 + 1e-9
+
+
+def test_the_slope_of_what_the_ground_gives_is_its_derivative() -> None:
+    asked = jnp.asarray(np.random.default_rng(0).standard_normal((200, 3)))
+
+    def given(one: Array) -> Array:
+        return reaction(one[None, :, None], 0.7)[0][0, :, 0]
+
+    expected = jax.vmap(jax.jacfwd(given))(asked)
+    np.testing.assert_allclose(reaction(asked[..., None], 0.7)[1][..., 0], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("speed", [1.0, 3.0])
+def test_a_capsule_that_slides_sideways_is_braked_until_it_rolls_as_in_the_truth(speed: float) -> None:
+    body = capsule()
+    states = np.zeros((1, 1, packed.SIZE))
+    states[..., packed.ORIENTATION] = Rotation.from_euler("y", 90.0, degrees=True).as_quat(scalar_first=True)
+    states[..., 2], states[..., 8] = body.links[0].radius, speed
+    none = np.zeros((1, 0, 3)), np.zeros((1, 1, 3))
+    true, _ = Truth(Scene((body,))).rollout(states, np.zeros((1, 40, 0, 3)))
+    for _ in range(40):
+        states = moved(states, compiled(body, 3)(states, *none))
+    np.testing.assert_allclose(states[..., 1], true[:, -1, :, 1], rtol=0.01)
+    np.testing.assert_allclose(states[..., [8, 10]], true[:, -1, :, [8, 10]].T, rtol=0.005)
+
+
+def test_who_moves_on_the_ground_goes_as_in_the_truth_several_times_as_long_where_its_forces_are_found() -> None:
+    scene = scenario("any_human_alone").scene
+    episodes, _ = scenario("any_human_alone").draw(48, 0)
+    body, sizes = scene.bodies[0], jnp.asarray(episodes.morphology)
+
+    def off(rounds: int) -> np.ndarray:
+        """Median distance [m] of the links from where they are, after every step."""
+
+        def advance(state: Array, control: Array) -> tuple[Array, Array]:
+            none = jnp.zeros((*state.shape[:2], 3), state.dtype)
+            found = free_motion(body, state, control, none, sizes, scene.gravity, scene.dt, Constants(rounds=rounds))
+            turned = rotation.integrate(packed.orientation(state), found.turned)
+            after = packed.pack(packed.position(state) + found.moved, turned, found.velocity, found.spin)
+            return after, packed.position(after)
+
+        first, controls = jnp.asarray(episodes.states[:, 0]), jnp.moveaxis(jnp.asarray(episodes.controls), 1, 0)
+        _, places = jax.jit(lambda *given: jax.lax.scan(advance, *given))(first, controls)
+        apart = np.linalg.norm(np.moveaxis(places, 0, 1) - episodes.states[:, 1:, :, :3], axis=-1)
+        return np.asarray(np.median(apart.mean(axis=2), axis=0))
+
+    with jax.enable_x64(False):
+        found, decided = off(3), off(0)
+    assert (3.0 * found[9:] < decided[9:]).all()
+    assert found[19] < 0.005

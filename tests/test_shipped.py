@@ -71,6 +71,20 @@ def test_the_shipped_human_and_what_it_strikes_err_no_more_than_they_did(
     assert launch["relative_error"]["median"] < launched[0] and launch["angle_deg"]["median"] < launched[1]
 
 
+def test_the_shipped_human_alone_errs_no_more_than_it_did_and_soon_half_as_much_as_the_one_that_kicks() -> None:
+    chosen = scenario("any_human_alone")
+    given, _ = chosen.draw(128, 3)
+
+    def errors(name: str) -> tuple[float, float]:
+        model, learned, _ = stored.load(stored.SHIPPED / f"{name}.json", chosen.scene)
+        windows = evaluation.evaluate(Simulator(model, learned), given, (10, 38))["windows"]
+        return windows["10"]["human"], windows["38"]["human"]
+
+    found, kicking = errors("any_human_alone"), errors("any_human")
+    assert found[0] < 0.002 and found[1] < 0.01
+    assert found[1] < 0.5 * kicking[1]
+
+
 def test_what_is_like_the_training_data_has_a_novelty_of_about_one(
     reference: Reference,
 ) -> None:
