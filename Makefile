@@ -55,6 +55,7 @@ bench: $(READY)
 	$(MODEL) --scene chain4 --seed 2 --bullet
 	$(MODEL) --scene human_capsule --seed 2
 	$(MODEL) --scene any_human --seed 2
+	$(MODEL) --scene any_human_alone --seed 2
 	$(MODEL) --scene human_ball --weights larp_model/weights/any_human.json --seed 2
 	$(MODEL) --scene human_ball --weights larp_model/weights/any_human.json --seed 2 --bodies varied
 	$(MODEL) --scene full_human --seed 2 --bodies varied
