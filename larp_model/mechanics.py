@@ -42,7 +42,7 @@ class Constants:
     many: held harder, a direction of sliding that is half a step old throws the body. held: see `compliance.HELD`.
     rounds: Newton steps in which the ground's forces are found, all of them at once, and what slides is held like what
     stands (`reaction`). 0: which end stands, slides or lifts is decided beforehand, each as if its link were free
-    (`ground`): quicker, and three times further from the truth after 0.1 s of motion and more.
+    (`Ends.decided`): quicker, and three times further from the truth after 0.1 s of motion and more.
     """
 
     closing: float = 0.2
@@ -147,16 +147,16 @@ def free_motion(
             bears, pushed = held(jax.tree.map(jnp.add, (inertia, push), bearing))
             return solve(bears, pushed, levels)
 
+        ends, whole = Ends.of(body, before, height, velocity, spin, sizes, h), jnp.sum(mass, axis=0, keepdims=True)
         if not constants.rounds:
-            return parting(ground(body, before, height, velocity, spin, sizes, gravity, h, constants))
-        ends = Ends.of(body, before, height, velocity, spin, sizes, h)
-        firm = constants.standing * jnp.sum(mass, axis=0, keepdims=True)
+            return parting(ends.decided(body, velocity, spin, gravity, h, constants, whole))
+        firm = constants.standing * whole
 
         def round_of(guess: tuple[Array, Array, Array], nothing: None) -> tuple[tuple[Array, Array, Array], None]:
             velocity, spin, met = guess
-            found = ends.velocity(velocity, spin)
-            met = jnp.maximum(met, decided(-ends.clearance - h * found[:, 2:], 1e-5))
-            return (*parting(ends.bearing(found, met, firm, body.surface.friction)), met), None
+            there = ends.velocity(velocity, spin)
+            met = jnp.maximum(met, decided(-ends.clearance - h * there[:, 2:], 1e-5))
+            return (*parting(ends.found(there, met, firm, body.surface.friction)), met), None
 
         falls = velocity + h * down, spin, jnp.zeros_like(ends.clearance)
         (velocity, spin, _), _ = jax.lax.scan(round_of, falls, length=constants.rounds)
@@ -438,48 +438,6 @@ def servos(
     return pull + h * mv(matrices, jnp.clip(wanted, -limit, limit)), hold
 
 
-def ground(
-    body: Body, matrices: Array, height: Array, velocity: Array, spin: Array, sizes: Array, gravity: float, h: float,
-    constants: Constants,
-) -> tuple[Inertia, Push]:  # fmt: skip
-    """What the ends of links that touch the ground add to inertia and push within `h` [s].
-
-    matrices (n, 3, 3, B) and height (n, 1, B) [m] of the links. Where an end is in the ground, the damped spring of the
-    body's surface says how fast it is to be, and a large mass that moves so holds it. Friction wants it to stand; what
-    slides is held along the direction of the sliding force alone. Of a body that falls freely it would be a law; where
-    joints pull, the network corrects it.
-    """
-    surface = body.surface
-    axes = jnp.array([link.axis for link in body.links], matrices.dtype)[..., None]
-    half, radius = 0.5 * sizes[:, :1] * mv(matrices, axes), sizes[:, 1:2]
-    mass = jnp.sum(sizes[:, 2:], axis=0, keepdims=True)
-    upright = jnp.array([0.0, 0.0, 1.0], matrices.dtype)[:, None]
-    unit = jnp.eye(3, dtype=matrices.dtype)[..., None]
-    damped = 1.0 + h * surface.damping
-
-    def end(arm: Array) -> tuple[Inertia, Push]:
-        """Of the ends whose lowest points are at `arm` (n, 3, B) [m] from the links' centres."""
-        speed = velocity + cross(spin, arm)
-        clearance, rising = height + arm[:, 2:], speed[:, 2:]
-        falling = rising - h * gravity
-        wanted = (rising - h * surface.stiffness * clearance) / (damped + h**2 * surface.stiffness)
-        pressed = wanted - falling  # the change of speed that the ground makes
-        bearing = decided(-clearance - h * falling, 1e-5) * decided(pressed, 1e-3)
-        sliding = speed * (1.0 - upright)
-        slip = jnp.sqrt(jnp.sum(sliding**2, axis=1, keepdims=True) + 1e-8)
-        sticks = decided(surface.friction * pressed - slip * (damped - 1.0) / damped, 1e-3)[:, None]
-        along = upright - surface.friction * sliding / slip
-        loosely = constants.sliding * along[:, :, None] * along[:, None]
-        hold = (mass * bearing)[:, None] * (sticks * constants.standing * unit + (1.0 - sticks) * loosely)
-        target = mv(hold, sliding / damped + wanted * upright)
-        mixed = cross_columns(arm, hold)
-        return Inertia(-cross_rows(mixed, arm), mixed, hold), Push(cross(arm, target), target)
-
-    down = radius * upright
-    added: tuple[Inertia, Push] = jax.tree.map(jnp.add, end(half - down), end(-half - down))
-    return added
-
-
 class Ends(NamedTuple):
     """Both ends of all links, (2 n, ..., B), one end of each after the other, and how the ground wants them to move.
 
@@ -494,7 +452,7 @@ class Ends(NamedTuple):
     @staticmethod
     def of(body: Body, matrices: Array, height: Array, velocity: Array, spin: Array, sizes: Array, h: float) -> Ends:
         """Of links that are so turned (n, 3, 3, B), so high (n, 1, B) [m] and so fast at first (n, 3, B)."""
-        surface, upright = body.surface, jnp.array([0.0, 0.0, 1.0], matrices.dtype)[:, None]
+        surface, upright = body.surface, _upright(matrices)
         axes = jnp.array([link.axis for link in body.links], matrices.dtype)[..., None]
         half, down = 0.5 * sizes[:, :1] * mv(matrices, axes), sizes[:, 1:2] * upright
         arm = jnp.concatenate([half - down, -half - down])
@@ -507,16 +465,42 @@ class Ends(NamedTuple):
         """The ends' velocities (2 n, 3, B), from the links'."""
         return twice(velocity) + cross(twice(spin), self.arm)
 
-    def bearing(self, guess: Array, met: Array, firm: Array, friction: float) -> tuple[Inertia, Push]:
-        """What the ends add to their links' inertia and push: the ground's impulses, linear around velocities `guess`.
+    def decided(
+        self, body: Body, velocity: Array, spin: Array, gravity: float, h: float, constants: Constants, mass: Array
+    ) -> tuple[Inertia, Push]:
+        """What they add to their links' inertia and push where each is judged as if its link were free.
+
+        Where an end is in the ground, a large share of the body's mass (1, 1, B) [kg] that moves as the ground allows
+        holds it. Friction wants it to stand; what slides is held along the direction of the sliding force alone. Of a
+        body that falls freely it would be a law; where joints pull, the network corrects it.
+        """
+        friction, damped = body.surface.friction, 1.0 + h * body.surface.damping
+        upright, unit = _upright(self.arm), jnp.eye(3, dtype=self.arm.dtype)[..., None]
+        speed = self.velocity(velocity, spin)
+        falling = speed[:, 2:] - h * gravity
+        pressed = self.allowed[:, 2:] - falling  # the change of speed that the ground makes
+        bearing = decided(-self.clearance - h * falling, 1e-5) * decided(pressed, 1e-3)
+        sliding = speed * (1.0 - upright)
+        slip = jnp.sqrt(jnp.sum(sliding**2, axis=1, keepdims=True) + 1e-8)
+        sticks = decided(friction * pressed - slip * (damped - 1.0) / damped, 1e-3)[:, None]
+        along = upright - friction * sliding / slip
+        loosely = constants.sliding * along[:, :, None] * along[:, None]
+        hold = (mass * bearing)[:, None] * (sticks * constants.standing * unit + (1.0 - sticks) * loosely)
+        return self.held_by(hold, mv(hold, self.allowed))
+
+    def found(self, guess: Array, met: Array, firm: Array, friction: float) -> tuple[Inertia, Push]:
+        """What they add to their links' inertia and push: the ground's impulses, linear around velocities `guess`.
 
         met (2 n, 1, B): 1 where an end is in the ground. firm (1, 1, B) [kg]: see `reaction`.
         """
         impulse, slope = reaction(firm * (self.allowed - guess), friction)
         hold = held(met[:, None] * firm[:, None] * slope)
-        push, mixed = met * impulse + mv(hold, guess), cross_columns(self.arm, hold)
+        return self.held_by(hold, met * impulse + mv(hold, guess))
+
+    def held_by(self, hold: Array, push: Array) -> tuple[Inertia, Push]:
+        """Inertia and push of the links whose ends masses (2 n, 3, 3, B) [kg] hold and momenta (2 n, 3, B) push."""
+        mixed, links = cross_columns(self.arm, hold), len(self.arm) // 2
         added = Inertia(-cross_rows(mixed, self.arm), mixed, hold), Push(cross(self.arm, push), push)
-        links = len(self.arm) // 2
         both: tuple[Inertia, Push] = jax.tree.map(lambda each: each[:links] + each[links:], added)
         return both
 
@@ -529,8 +513,7 @@ def reaction(asked: Array, friction: float) -> tuple[Array, Array]:
     ground allows, from the polar cone, so that J is its projection onto the cone (E. Todorov, "Convex and analytically
     invertible dynamics with contacts and constraints", 2014). The slopes are symmetric and not negative.
     """
-    upright = jnp.array([0.0, 0.0, 1.0], asked.dtype)[:, None]
-    unit = jnp.eye(3, dtype=asked.dtype)[..., None]
+    upright, unit = _upright(asked), jnp.eye(3, dtype=asked.dtype)[..., None]
     pressing, sideways = asked[:, 2:], asked * (1.0 - upright)
     pull = jnp.sqrt(jnp.sum(sideways**2, axis=1, keepdims=True) + 1e-12)
     along = upright + friction * sideways / pull
@@ -546,6 +529,11 @@ def reaction(asked: Array, friction: float) -> tuple[Array, Array]:
 def twice(links: Array) -> Array:
     """Of both ends of every link."""
     return jnp.concatenate([links, links])
+
+
+def _upright(like: Array) -> Array:
+    """The vertical (3, 1), in the precision of another array."""
+    return jnp.array([0.0, 0.0, 1.0], like.dtype)[:, None]
 
 
 def decided(value: Array, width: float) -> Array:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -285,3 +286,11 @@ def test_a_film_is_written_in_the_format_of_its_name(suffix: str, recording: Rec
 def test_a_film_of_no_known_format_is_refused() -> None:
     with pytest.raises(ValueError, match=r"video is 'kick.avi', but its name must end in .mp4 or .gif"):
         check_film("kick.avi")
+
+
+def test_a_file_is_not_handed_to_a_client_that_has_left(page: LivePage, recording: Recording) -> None:
+    gone = Mock(client_id=7)
+    page._recording, page.files = recording, lambda kind, recording: ("kick.html", b"<!doctype html>")
+    page._download(gone, "html")
+    assert page._filing.acquire(timeout=30.0), "the next file may be made"
+    gone.send_file_download.assert_not_called()

@@ -84,7 +84,7 @@ def frames(recording: Recording, size: tuple[int, int] = (1280, 720), rate: floa
     across = size[1] / size[0]
     figure = Figure((size[0] / DOTS, size[1] / DOTS), DOTS, facecolor=SKY)
     canvas = FigureCanvasAgg(figure)
-    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(-1.0, 1.0), ylim=(-across, across), autoscale_on=False)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(-1.0, 1.0), ylim=(-across, across))
     axes.set_axis_off()
     _ground(axes, camera)
     canvas.draw()
