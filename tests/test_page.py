@@ -107,6 +107,20 @@ def seen(browser: Browser, served: Served) -> Iterator[Page]:
     page.close()
 
 
+def again(seen: Page) -> None:
+    """Load the page anew, which the browser refuses for as long as it still changes from the page before."""
+
+    def loads() -> bool:
+        try:
+            seen.reload(wait_until="commit")
+        except playwright.Error as refused:
+            assert "Not attached to an active page" in refused.message, refused
+            return False
+        return True
+
+    until(loads)
+
+
 def kick_button(seen: Page) -> Locator:
     """The button that kicks; its key does not while a control has the keyboard."""
     return seen.get_by_role("button", name="Kick", exact=True)
@@ -398,7 +412,7 @@ def test_reloads_do_not_hold_up_who_plans(played: Page, served: Served) -> None:
     before = served.live.run
     kick_button(seen).click()
     for _ in range(4):
-        seen.reload(wait_until="commit")
+        again(seen)
     until(lambda: served.live.run is not before)
     assert served.live.run is not None and served.live.run.truth_error_m < np.inf
     until(lambda: len(served.page._views) == 1)
