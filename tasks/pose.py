@@ -34,7 +34,7 @@ from tasks.keypoints import figure as figures
 from tasks.keypoints import formats, lift, metrics, physical
 from tasks.keypoints.kept import Kept, Spent, fingerprint
 from tasks.keypoints.picture import pose_picture
-from tasks.keypoints.points import Keypoints
+from tasks.keypoints.points import Keypoints, interpolated
 from tasks.models import ROWS, DynamicsName
 from tasks.motions import angles, bvh
 from tasks.presets import PresetName
@@ -115,13 +115,6 @@ class Reconstruction(NamedTuple):
         return bool((self.states[:, 0, 2] < 0.5 * standing_height(self.body)).any())
 
 
-def at_frames(points: np.ndarray, dt: float, film: Keypoints) -> np.ndarray:
-    """Points (N, P, 3) of every step of so many seconds at a film's frames, in between linearly."""
-    at, steps = np.arange(len(film)) / film.rate, np.arange(len(points)) * dt
-    found = [np.interp(at, steps, each) for each in points.reshape(len(points), -1).T]
-    return np.stack(found, axis=1).reshape(len(film), *points.shape[1:])
-
-
 def reconstruct(
     film: Keypoints,
     lifted: lift.Lifted,
@@ -165,10 +158,9 @@ def reconstruct(
     execution = physical.fit(scene, planner, wanted, state, preset.every, seed, observe, begun)
     states = np.stack(execution.states)
     executed = np.asarray(points.points(states.astype(np.float32)), float)
-    return Reconstruction(
-        lifted, body, figure.all_points(lifted.pose, lifted.proportions),
-        at_frames(executed, scene.dt, film), wanted, states, spent,
-    )  # fmt: skip
+    found = interpolated(executed, 1.0 / scene.dt, film.times)
+    start = figure.all_points(lifted.pose, lifted.proportions)
+    return Reconstruction(lifted, body, start, found, wanted, states, spent)
 
 
 def overlay_of(film: Keypoints, made: Reconstruction) -> Overlay:

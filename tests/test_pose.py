@@ -21,7 +21,7 @@ from tasks.keypoints import figure as figures
 from tasks.keypoints import filmed, lift, metrics, physical
 from tasks.keypoints.figure import SHARED
 from tasks.keypoints.kept import Kept
-from tasks.keypoints.points import POINTS, Keypoints
+from tasks.keypoints.points import POINTS, Keypoints, interpolated
 from tasks.motions import angles, bvh
 from tasks.motions.references import embedded
 
@@ -142,13 +142,13 @@ def test_frames_at_the_ends_in_which_nobody_is_seen_are_left_out(film: dict[str,
     np.testing.assert_array_equal(left.places[-1], whole.places[len(whole) - 6])
 
 
-def test_who_moves_steadily_does_so_in_every_frame_too_whatever_the_film_s_rate() -> None:
-    frames, velocity = 60, np.array([1.0, -0.5, 0.25])
-    film = Keypoints(np.zeros((frames, len(POINTS), 2)), np.ones((frames, len(POINTS))), 60.0, (100.0, 100.0))
-    executed = np.arange(99)[:, None, None] * 0.01 * np.broadcast_to(velocity, (len(POINTS), 3))
-    found = pose.at_frames(executed, 0.01, film)
+def test_who_moves_steadily_does_so_at_another_rate_too_and_rests_where_the_motion_ends() -> None:
+    times, velocity = np.arange(60) / 60.0, np.array([1.0, -0.5, 0.25])
+    executed = np.arange(98)[:, None, None] * 0.01 * np.broadcast_to(velocity, (len(POINTS), 3))
+    found = interpolated(executed, 100.0, times)
     np.testing.assert_allclose(60.0 * np.diff(found[:-1], axis=0), np.broadcast_to(velocity, found[1:-1].shape))
     np.testing.assert_array_equal(found[-1], executed[-1])
+    np.testing.assert_array_equal(interpolated(executed[:1], 100.0, times), np.repeat(executed[:1], 60, axis=0))
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from tasks.keypoints import figure as figures
 from tasks.keypoints import filmed, lift, metrics, physical
 from tasks.keypoints.camera import Camera
 from tasks.keypoints.figure import SHARED
-from tasks.keypoints.points import Keypoints
+from tasks.keypoints.points import Keypoints, interpolated
 from tasks.models import DynamicsName
 from tasks.motions import skeleton
 from tasks.motions.references import embedded, motion_of
@@ -94,7 +94,8 @@ def filmed_points(clip: Path | None, seconds: float) -> np.ndarray:
         points, rate = filmed.points_of(motion), motion.rate
         kick = skeleton.toe_speed(motion).max() >= 1.5 * skeleton.SLOWEST_KICK
         strike = (skeleton.strike(motion) if kick else BEFORE * len(points)) / rate
-    points = filmed.resampled(points, rate, RATE)
+    whole = np.arange(int((len(points) - 1) * RATE / rate) + 1)
+    points = interpolated(points, rate, whole / RATE)
     count = min(round(seconds * RATE), len(points))
     first = int(np.clip(round((strike - BEFORE * seconds) * RATE), 0, len(points) - count))
     return points[first : first + count]

@@ -101,11 +101,3 @@ def panned(camera: Camera, points: np.ndarray) -> np.ndarray:
 
 def _normal(random: np.random.Generator, *shape: int) -> np.ndarray:
     return random.standard_normal(shape)
-
-
-def resampled(points: np.ndarray, rate: float, wanted: float) -> np.ndarray:
-    """Points (T, P, 3) at another number of frames a second, in between linearly."""
-    times = np.arange(int((len(points) - 1) * wanted / rate) + 1) * rate / wanted
-    before = np.minimum(times.astype(int), len(points) - 2)
-    share = (times - before)[:, None, None]
-    return (1.0 - share) * points[before] + share * points[before + 1]

@@ -34,7 +34,7 @@ from tasks.data import stray
 from tasks.keypoints.camera import Camera
 from tasks.keypoints.figure import Figure, Pose
 from tasks.keypoints.lift import OUTLIER, SLOW, Lifted, noise
-from tasks.keypoints.points import FEET, POINTS, Keypoints
+from tasks.keypoints.points import FEET, POINTS, Keypoints, interpolated
 from tasks.motions.references import clearance, leading, spinning
 from tasks.presets import PresetName
 
@@ -89,13 +89,11 @@ class Wanted(NamedTuple):
 def wanted_of(scene: Scene, figure: Figure, lifted: Lifted, keypoints: Keypoints) -> Wanted:
     """The kinematic start and the keypoints at every step of the scene's time."""
     human = scene.bodies[0]
-    begin = np.arange(len(keypoints)) / keypoints.rate
+    begin, rate = keypoints.times, keypoints.rate
     times = np.arange(int(begin[-1] / scene.dt + 1e-6) + 1) * scene.dt
-    place = np.stack([np.interp(times, begin, axis) for axis in lifted.pose.place.T], axis=1)
+    place = interpolated(lifted.pose.place, rate, times)
     root = Slerp(begin, Rotation.from_matrix(lifted.pose.turn))(times)
-    flat = lifted.pose.angles.reshape(len(begin), -1)
-    angles = np.stack([np.interp(times, begin, each) for each in flat.T], axis=1).reshape(len(times), -1, 3)
-    angles = np.clip(angles, figure.lower, figure.upper)
+    angles = np.clip(interpolated(lifted.pose.angles, rate, times), figure.lower, figure.upper)
     states = np.zeros((len(times), len(human.links), packed.SIZE))
     turns = [root]
     for child, joint in enumerate(human.joints, start=1):
@@ -110,9 +108,8 @@ def wanted_of(scene: Scene, figure: Figure, lifted: Lifted, keypoints: Keypoints
     found = lifted.camera.project(figure.all_points(lifted.pose, lifted.proportions))
     apart = np.linalg.norm(found - seen, axis=-1) / noise(keypoints, lifted.camera)
     trusted = keypoints.confidence / (1.0 + (apart / OUTLIER) ** 2) ** 2
-    nearest = np.minimum(np.rint(times * keypoints.rate).astype(int), len(keypoints) - 1)
-    both = np.where(keypoints.seen[..., None], seen, found).reshape(len(begin), -1)
-    places = np.stack([np.interp(times, begin, each) for each in both.T], axis=1).reshape(len(times), -1, 2)
+    nearest = np.minimum(np.rint(times * rate).astype(int), len(keypoints) - 1)
+    places = interpolated(np.where(keypoints.seen[..., None], seen, found), rate, times)
     points = figure.all_points(Pose(place, root.as_matrix(), angles), lifted.proportions)[:, FEET]
     speed = np.linalg.norm(np.gradient(points, scene.dt, axis=0), axis=-1)
     stands = np.exp(-((np.maximum(points[..., 2] - 0.03, 0.0) / 0.05) ** 2)) / (1.0 + (speed / SLOW) ** 2) ** 2

@@ -52,7 +52,20 @@ class Keypoints:
         """Which points were found (T, P)."""
         return self.confidence > 0.0
 
+    @property
+    def times(self) -> np.ndarray:
+        """When the frames were taken (T,) [s], the first at 0."""
+        return np.arange(len(self)) / self.rate
+
     def cut(self, first: int, last: int) -> Keypoints:
         """The frames from `first` to `last`, both included, or what there is of them."""
         frames = slice(max(first, 0), last + 1)
         return replace(self, places=self.places[frames], confidence=self.confidence[frames])
+
+
+def interpolated(values: np.ndarray, rate: float, times: np.ndarray) -> np.ndarray:
+    """Values (T, ...), so many a second, at times (N,) [s] from 0 on: in between linearly, and the last from its on."""
+    at = np.minimum(times * rate, len(values) - 1)
+    before = at.astype(int)
+    share = (at - before).reshape(-1, *(1,) * (values.ndim - 1))
+    return (1.0 - share) * values[before] + share * values[np.minimum(before + 1, len(values) - 1)]
