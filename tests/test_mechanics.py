@@ -77,10 +77,15 @@ def compiled(body: Body, rounds: int = 0) -> Any:
     return lambda *given, gravity=9.81, dt=0.01: found(*given, gravity, dt)
 
 
-def moved(states: np.ndarray, motion: Motion) -> np.ndarray:
+def advanced(states: Array, motion: Motion) -> Array:
     """States (N, n, 13) after a motion."""
-    turned = rotation.integrate(jnp.asarray(states[..., packed.ORIENTATION]), motion.turned)
-    return np.asarray(packed.pack(jnp.asarray(states[..., :3]) + motion.moved, turned, motion.velocity, motion.spin))
+    turned = rotation.integrate(packed.orientation(states), motion.turned)
+    return packed.pack(packed.position(states) + motion.moved, turned, motion.velocity, motion.spin)
+
+
+def moved(states: np.ndarray, motion: Motion) -> np.ndarray:
+    """The same, out of JAX."""
+    return np.asarray(advanced(jnp.asarray(states), motion))
 
 
 def momenta(body: Body, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -365,9 +370,8 @@ def test_who_moves_on_the_ground_is_three_times_nearer_to_the_truth_where_its_fo
         def advance(state: Array, control: Array) -> tuple[Array, Array]:
             none = jnp.zeros((*state.shape[:2], 3), state.dtype)
             found = free_motion(body, state, control, none, sizes, scene.gravity, scene.dt, Constants(rounds=rounds))
-            turned = rotation.integrate(packed.orientation(state), found.turned)
-            after = packed.pack(packed.position(state) + found.moved, turned, found.velocity, found.spin)
-            return after, packed.position(after)
+            state = advanced(state, found)
+            return state, packed.position(state)
 
         first, controls = jnp.asarray(episodes.states[:, 0]), jnp.moveaxis(jnp.asarray(episodes.controls), 1, 0)
         _, places = jax.jit(lambda *given: jax.lax.scan(advance, *given))(first, controls)

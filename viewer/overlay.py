@@ -14,7 +14,7 @@ import numpy as np
 from larp_model.files import write_whole
 from larp_model.scene import Scene
 from larp_model.state import SIZE
-from viewer.replay import FRAME, captioned
+from viewer.replay import captioned, played
 from viewer.scene_view import REFERENCE, SceneView
 from viewer.server import close_server, open_server
 from viewer.stage import ground
@@ -73,15 +73,15 @@ def overlay_page(overlay: Overlay) -> str:
             apart = server.scene.add_line_segments("/apart", first, KEYPOINT, thickness=0.006)
         view = server.initial_camera
         view.fov, (view.position, view.look_at) = overlay.field_of_view, overlay.camera
-        film, stride = server.get_scene_serializer(), max(1, round(FRAME / scene.dt))
-        for row in range(0, min(len(overlay.states), len(overlay.start)), stride):
+
+        def show(row: int) -> None:
             pairs = overlay.at(row)
             with server.atomic():
                 human.update(overlay.states[row])
                 start.update(overlay.start[row])
                 points.points, apart.points = pairs[:, 0], pairs
-            film.insert_sleep(stride * scene.dt)
-        page = film.as_html()
+
+        page = played(server, min(len(overlay.states), len(overlay.start)), scene.dt, show)
     finally:
         close_server(server)
     return captioned(page, "Motion from keypoints", [*overlay.summary, LEGEND])

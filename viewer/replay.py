@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from html import escape
 from pathlib import Path
+
+import viser
 
 from larp_model.files import write_whole
 from viewer.recording import Recording
@@ -33,18 +36,26 @@ def page_of(recording: Recording) -> str:
         stage = Stage(server, recording.scene, recording.target, recording.traced)
         stage.frame(whole(recording))
         miss = stage.lane.trace(recording.path, recording.predicted_path)
-        film = server.get_scene_serializer()
-        stride = max(1, round(FRAME / recording.scene.dt))
-        for row in range(0, len(recording.states), stride):
+
+        def show(row: int) -> None:
             stage.lane.show(
                 recording.states[row], prediction=recording.predicted_at(row), reference=recording.reference_at(row)
             )
-            film.insert_sleep(stride * recording.scene.dt)
-        page = film.as_html()
+
+        page = played(server, len(recording.states), recording.scene.dt, show)
     finally:
         close_server(server)
     facts = {"nearest to the target": f"{100.0 * miss:.1f} cm", **recording.summary}
     return captioned(page, recording.title or "Replay", [*(f"{name}: {text}" for name, text in facts.items()), LEGEND])
+
+
+def played(server: viser.ViserServer, rows: int, dt: float, show: Callable[[int], None]) -> str:
+    """HTML in which a server's scene plays, as `show` sets it for some of the rows of a motion, one every `dt` [s]."""
+    film, stride = server.get_scene_serializer(), max(1, round(FRAME / dt))
+    for row in range(0, rows, stride):
+        show(row)
+        film.insert_sleep(stride * dt)
+    return film.as_html()
 
 
 def captioned(page: str, title: str, lines: list[str]) -> str:
