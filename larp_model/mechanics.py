@@ -155,7 +155,7 @@ def free_motion(
         def round_of(guess: tuple[Array, Array, Array], nothing: None) -> tuple[tuple[Array, Array, Array], None]:
             velocity, spin, met = guess
             there = ends.velocity(velocity, spin)
-            met = jnp.maximum(met, decided(-ends.clearance - h * there[:, 2:], 1e-5))
+            met = jnp.maximum(met, ramp(-ends.clearance - h * there[:, 2:], 1e-5))
             return (*parting(ends.found(there, met, firm, body.surface.friction)), met), None
 
         falls = velocity + h * down, spin, jnp.zeros_like(ends.clearance)
@@ -479,10 +479,10 @@ class Ends(NamedTuple):
         speed = self.velocity(velocity, spin)
         falling = speed[:, 2:] - h * gravity
         pressed = self.allowed[:, 2:] - falling  # the change of speed that the ground makes
-        bearing = decided(-self.clearance - h * falling, 1e-5) * decided(pressed, 1e-3)
+        bearing = ramp(-self.clearance - h * falling, 1e-5) * ramp(pressed, 1e-3)
         sliding = speed * (1.0 - upright)
         slip = jnp.sqrt(jnp.sum(sliding**2, axis=1, keepdims=True) + 1e-8)
-        sticks = decided(friction * pressed - slip * (damped - 1.0) / damped, 1e-3)[:, None]
+        sticks = ramp(friction * pressed - slip * (damped - 1.0) / damped, 1e-3)[:, None]
         along = upright - friction * sliding / slip
         loosely = constants.sliding * along[:, :, None] * along[:, None]
         hold = (mass * bearing)[:, None] * (sticks * constants.standing * unit + (1.0 - sticks) * loosely)
@@ -521,7 +521,7 @@ def reaction(asked: Array, friction: float) -> tuple[Array, Array]:
     across = unit - upright[:, None] * upright - (sideways / pull)[:, :, None] * (sideways / pull)[:, None]
     bent = jnp.clip(friction * share / pull, 0.0, 1.0)
     sliding = along[:, :, None] * along[:, None] / (1.0 + friction**2) + bent[:, None] * across
-    stands, pushed = held((pull <= friction * pressing, friction * pull > -pressing))  # see `decided`
+    stands, pushed = held((pull <= friction * pressing, friction * pull > -pressing))  # see `ramp`
     impulse = jnp.where(stands, asked, share * along) * pushed
     return impulse, jnp.where(stands[:, None], unit, sliding) * pushed[:, None]
 
@@ -536,7 +536,7 @@ def _upright(like: Array) -> Array:
     return jnp.array([0.0, 0.0, 1.0], like.dtype)[:, None]
 
 
-def decided(value: Array, width: float) -> Array:
+def ramp(value: Array, width: float) -> Array:
     """0 where a value is negative, 1 from `width` on, and no slope between.
 
     A compiler works a comparison out anew beside every block of a matrix, and may round otherwise: blocks that are not
