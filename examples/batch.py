@@ -1,29 +1,41 @@
 """Many kicks without a page, as a data set: one npz file of targets, states and joint targets, in float32.
 
-python examples/batch.py 1000 runs/kicks.npz
+python examples/batch.py 1000 runs/kicks.npz        # and, as a last argument, how many processes share the work
 """
 
 import sys
+from concurrent.futures import ProcessPoolExecutor
+from itertools import chain
+from multiprocessing import get_context
 
 import numpy as np
 from rich.progress import track
 
 from larp_model.files import written_whole
-from tasks.command import remember_compilations
 from tasks.data import random_task
 from tasks.kick import Kick
 
+Row = tuple[np.ndarray, np.ndarray, np.ndarray, float, bool]
 
-def main(count: int = 1000, path: str = "runs/kicks.npz", seed: int = 0) -> None:
-    """Kick to random targets, the ball's spot moved a little each time; compiled once."""
-    remember_compilations()
-    kick, random, rows = Kick.standard(), np.random.default_rng(seed), []
-    for number in track(range(count), "kicks"):
-        target, offset = random_task(random)
+
+def kicks(kick: Kick, numbers: np.ndarray, seed: int) -> list[Row]:
+    """Kicks to random targets, the ball's spot moved a little each time; compiled once."""
+    rows = []
+    for number in track(numbers.tolist(), "kicks"):
+        target, offset = random_task(np.random.default_rng((seed, number)))
         run = kick.to(target, preset="fast", seed=number, state=kick.start(offset))
         rows.append((target, run.states, run.joint_targets, run.truth_error_m, run.summary["fell"]))
-    steps = min(len(row[1]) for row in rows)  # what lies beyond them, of kicks that took longer, is left out
-    targets, states, controls, errors, fell = zip(*rows, strict=True)
+    return rows
+
+
+def main(count: int = 1000, path: str = "runs/kicks.npz", processes: int = 1, seed: int = 0) -> None:
+    """Share the kicks among processes, gather them, write the file."""
+    shares = np.array_split(np.arange(count), processes)
+    # Spawned, not forked: JAX has threads, which a fork would lack and wait for.
+    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
+        made = pool.map(kicks, [Kick.standard()] * processes, shares, [seed] * processes)
+        targets, states, controls, errors, fell = zip(*chain.from_iterable(made), strict=True)
+    steps = min(map(len, states))  # what lies beyond them, of kicks that took longer, is left out
     arrays = {
         "targets": np.array(targets, np.float32),  # (N, 3) [m]
         "states": np.array([each[:steps] for each in states], np.float32),  # (N, T, L, 13)

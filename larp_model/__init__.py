@@ -2,6 +2,7 @@
 
 from larp_model.bodies import ball, capsule, chain, human, human_and_ball, standing_height
 from larp_model.designs import DESIGNS
+from larp_model.errors import InputError
 from larp_model.networks import Weights
 from larp_model.parts.part import Model
 from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface
@@ -12,6 +13,7 @@ __version__ = "0.1.0"
 __all__ = [
     "DESIGNS",
     "Body",
+    "InputError",
     "Joint",
     "Link",
     "Model",

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from larp_model.anatomy import ANATOMIES, KINDS, Detail, Segment
+from larp_model.errors import InputError
 from larp_model.names import require_known
 from larp_model.scene import Body, Joint, Link, Pair, Scene, Surface, Vector
 
@@ -20,7 +21,7 @@ LEG_SURFACE = Surface.bouncing(contact_time=0.020, restitution=0.4, friction=0.5
 def _positive(**values: float) -> None:
     for name, value in values.items():
         if not (math.isfinite(value) and value > 0.0):
-            raise ValueError(f"{name} is {value!r}, but must be a positive finite number")
+            raise InputError(f"{name} is {value!r}, but must be a positive finite number")
 
 
 def ball(name: str = "ball", radius: float = 0.11, mass: float = 0.43, surface: Surface = BALL_SURFACE) -> Body:
@@ -40,7 +41,7 @@ def capsule(
 def chain(name: str = "chain", links: int = 4, length: float = 0.3, radius: float = 0.06, mass: float = 1.0) -> Body:
     """Capsules in a row, tied end to end by ball joints without motors. length, radius [m], mass of each [kg]."""
     if not isinstance(links, int) or links < 1:
-        raise ValueError(f"links is {links!r}, but must be an integer of at least 1")
+        raise InputError(f"links is {links!r}, but must be an integer of at least 1")
     _positive(length=length, radius=radius, mass=mass)
     parts = tuple(Link(f"link{i}", length, radius, mass) for i in range(links))
     reach = (0.0, 0.0, 1.0 + 2.0 * radius / length)
@@ -95,7 +96,7 @@ def detail_of(body: Body) -> Detail:
     for detail, kind in KINDS.items():
         if body.kind == kind:
             return detail
-    raise ValueError(f"body {body.name!r} is a {body.kind}, but must be one of {', '.join(KINDS.values())}")
+    raise InputError(f"body {body.name!r} is a {body.kind}, but must be one of {', '.join(KINDS.values())}")
 
 
 def _usual_human(name: str, detail: Detail) -> Body:

@@ -50,4 +50,7 @@ def _start(module: str) -> None:
     problem = hidden()
     if problem:
         sys.exit(f"error: {problem}")
-    import_module(module).cli()
+    try:
+        import_module(module).cli()
+    except KeyboardInterrupt:  # while modules are imported; `tasks.command.run` sees all later ones
+        sys.exit(130)

@@ -13,6 +13,7 @@ from jax import Array
 
 from larp_model import kinematics, rotation
 from larp_model import state as packed
+from larp_model.errors import InputError
 from larp_model.meeting import first_contacts
 from larp_model.networks import Weights
 from larp_model.parts.part import Model, measure
@@ -64,7 +65,7 @@ def evaluate(simulator: Simulator, episodes: Trajectories, windows: Sequence[int
     """
     longest = max(windows)
     if episodes.controls.shape[1] < longest:
-        raise ValueError(f"episodes have {episodes.controls.shape[1]} steps, but the windows need {longest}")
+        raise InputError(f"episodes have {episodes.controls.shape[1]} steps, but the windows need {longest}")
     scene = simulator.scene
     controls, torques = episodes.controls[:, :longest], episodes.torques[:, :longest]
     predicted = predict(simulator, episodes.states[:, 0], controls, torques, episodes.morphology)
@@ -139,7 +140,7 @@ def launch(simulator: Simulator, episodes: Trajectories, before: int) -> dict[st
     scene = simulator.scene
     row = struck(scene)
     if row is None:
-        raise ValueError("simulator.scene has no body of one link that another can strike")
+        raise InputError("simulator.scene has no body of one link that another can strike")
     contacts = first_contacts(scene.between, episodes)
     steps = before + LAUNCH_STEPS
     rows = np.flatnonzero((contacts >= before) & (contacts + LAUNCH_STEPS <= episodes.controls.shape[1]))

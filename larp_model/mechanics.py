@@ -239,7 +239,7 @@ def responses(body: Body, rows: np.ndarray, matrices: Array, morphology: Array, 
 
     rows: (P,). matrices: (B, n, 3, 3) rotations of all links. morphology (B or 1, n, 3).
     """
-    count = len(matrices)
+    count = matrices.shape[0]
     morphology = jnp.broadcast_to(morphology, (count, *morphology.shape[1:]))
     matrices, sizes = (jnp.tile(jnp.moveaxis(each, 0, -1), len(after)) for each in (matrices, morphology))
     passed, stronger = (
@@ -248,7 +248,8 @@ def responses(body: Body, rows: np.ndarray, matrices: Array, morphology: Array, 
     )
     tied = turned_anchors(body, local_anchors(body, sizes), matrices)
     unit, still = jnp.eye(3, dtype=matrices.dtype)[..., None], jnp.zeros_like(matrices[:, 0])
-    hold = jnp.stack([resisting(each, passed, stronger) for each in body.joints])[:, None, None] * unit
+    stiff = jnp.array([resisting(each, passed, stronger) for each in body.joints], matrices.dtype)
+    hold = jnp.reshape(stiff, (-1, 1, 1, passed.shape[0])) * unit
     levels = [
         Level(links, parents, *(each[links - 1] for each in (*tied, still[1:], still[1:], hold)))
         for links, parents in tree(body)

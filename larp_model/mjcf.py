@@ -20,6 +20,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from larp_model.bodies import human, segment_of
+from larp_model.errors import InputError
 from larp_model.names import require_file, require_known
 from larp_model.scene import Body, Joint, Link, Vector
 
@@ -60,7 +61,7 @@ def humanoid(source: str | Path, names: Mapping[str, str] | None = None, name: s
     """The humanoid of an MJCF file as a human of 13 links: see above. `bodies.kicking` gives it a ball.
 
     It stands along z and faces x. names: what the file calls our links, {"left_shin": "calf_l", ...}; those left out
-    are found by usual names. ValueError where a link is missing, a joint is no hinge or ball, a geom is
+    are found by usual names. InputError where a link is missing, a joint is no hinge or ball, a geom is
     neither capsule nor sphere, or bodies are tied by more than joints.
     """
     path = Path(source)
@@ -68,12 +69,12 @@ def humanoid(source: str | Path, names: Mapping[str, str] | None = None, name: s
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
-        raise ValueError(
+        raise InputError(
             f"source: {path.name} is no MJCF file that MuJoCo reads: {str(error).splitlines()[0]}"
         ) from None
     for what, count in (("equality constraints", model.neq), ("tendons", model.ntendon)):
         if count:
-            raise ValueError(f"source: {path.name} has {count} {what}, but only joints can tie links")
+            raise InputError(f"source: {path.name} has {count} {what}, but only joints can tie links")
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     usual = human(name)
@@ -94,7 +95,7 @@ def _named(file: str, model: mujoco.MjModel, links: Sequence[str], names: dict[s
         wanted = [names[link]] if link in names else [body for body in bodies if usual_name(body) == link]
         if len(wanted) != 1 or wanted[0] not in bodies:
             had = "several bodies" if len(wanted) > 1 else "no body"
-            raise ValueError(f"source: {file} has {had} for {link!r}, but needs one; it has {', '.join(bodies)}")
+            raise InputError(f"source: {file} has {had} for {link!r}, but needs one; it has {', '.join(bodies)}")
         own[link] = int(model.body(wanted[0]).id)
     return own
 
@@ -105,7 +106,7 @@ def _owners(file: str, model: mujoco.MjModel, own: Mapping[str, int]) -> dict[in
     for body in range(1, model.nbody):  # parents come first
         above = int(model.body_parentid[body])
         if body not in owners and above not in owners:
-            raise ValueError(
+            raise InputError(
                 f"source: {file}: {model.body(body).name!r} is none of a human's links, and on none of them"
             )
         owners.setdefault(body, owners.get(above, ""))
@@ -131,12 +132,12 @@ def _placed(file: str, model: mujoco.MjModel, data: mujoco.MjData, owners: Mappi
         kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
         if kind not in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE):
             said, body = kind.name.removeprefix("mjGEOM_").lower(), model.body(model.geom_bodyid[geom]).name
-            raise ValueError(f"source: {file}: a geom of {body!r} is a {said}, but must be a capsule or a sphere")
+            raise InputError(f"source: {file}: a geom of {body!r} is a {said}, but must be a capsule or a sphere")
         half = size[1] * data.geom_xmat[geom].reshape(3, 3)[:, 2] * (kind == mujoco.mjtGeom.mjGEOM_CAPSULE)
         ends.append((data.geom_xpos[geom] - half, data.geom_xpos[geom] + half))
         radii.append(size[0])
     if not ends:
-        raise ValueError(f"source: {file}: {link!r} has no geom, but needs a capsule or a sphere")
+        raise InputError(f"source: {file}: {link!r} has no geom, but needs a capsule or a sphere")
     return Placed(np.array(ends), np.array(radii), float(model.body_mass[rows].sum()))
 
 
@@ -157,14 +158,14 @@ def _joints(
             kind = mujoco.mjtJoint(model.jnt_type[hinge])
             if kind not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_BALL):
                 said = kind.name.removeprefix("mjJNT_").lower()
-                raise ValueError(f"source: {file}: joint {model.joint(hinge).name!r} is a {said}, but must be a hinge")
+                raise InputError(f"source: {file}: joint {model.joint(hinge).name!r} is a {said}, but must be a hinge")
         place = data.xanchor[hinges].mean(axis=0) if len(hinges) else data.xpos[body]
         ties[frozenset((named[body], named[above]))] = Tie(place, not len(hinges))
     found = {}
     for link, joint in zip(usual.links[1:], usual.joints, strict=True):
         parent = usual.links[joint.parent].name
         if (tie := ties.get(frozenset((link.name, parent)))) is None:
-            raise ValueError(f"source: {file} does not tie {link.name!r} to {parent!r}, as a human's are")
+            raise InputError(f"source: {file} does not tie {link.name!r} to {parent!r}, as a human's are")
         found[link.name] = tie
     return found
 

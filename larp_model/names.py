@@ -6,12 +6,14 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 from pathlib import Path
 
+from larp_model.errors import InputError
+
 
 def require_known(argument: str, name: str, known: Iterable[str]) -> None:
     """Refuses a name that is none of the known ones."""
     names = [str(each) for each in known]
     if name not in names:
-        raise ValueError(f"{argument} is {name!r}, but must be one of {', '.join(names)}{meant(name, names)}")
+        raise InputError(f"{argument} is {name!r}, but must be one of {', '.join(names)}{meant(name, names)}")
 
 
 def require_file(argument: str, path: str | Path) -> None:
@@ -19,7 +21,7 @@ def require_file(argument: str, path: str | Path) -> None:
     path = Path(path)
     if not path.is_file():
         beside = [each.name for each in path.parent.iterdir()] if path.parent.is_dir() else []
-        raise ValueError(f"{argument} is {str(path)!r}, but no such file exists{meant(path.name, beside)}")
+        raise InputError(f"{argument} is {str(path)!r}, but no such file exists{meant(path.name, beside)}")
 
 
 def meant(name: str, names: Iterable[str]) -> str:

@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from larp_model.errors import InputError
+
 
 class Statistics(NamedTuple):
     """Mean and spread of a feature vector (F,), from data; see `floored`."""
@@ -80,7 +82,7 @@ class Size:
         for field in ("layers", "width"):
             value = getattr(self, field)
             if not (isinstance(value, int) and value >= 1):
-                raise ValueError(f"size.{field} is {value!r}, but must be an integer of at least 1")
+                raise InputError(f"size.{field} is {value!r}, but must be an integer of at least 1")
 
     def network(self, outputs: int) -> Perceptron:
         """The perceptron with so many outputs."""

@@ -14,18 +14,20 @@ from itertools import product
 
 import numpy as np
 
+from larp_model.errors import InputError
+
 Vector = tuple[float, float, float]
 
 
 def _check(owner: str, name: str, value: float, minimum: float, *, strict: bool) -> None:
     if not (math.isfinite(value) and (value > minimum if strict else value >= minimum)):
         relation = ">" if strict else ">="
-        raise ValueError(f"{owner}.{name} is {value!r}, but must be a finite number {relation} {minimum:g}")
+        raise InputError(f"{owner}.{name} is {value!r}, but must be a finite number {relation} {minimum:g}")
 
 
 def _check_vector(owner: str, name: str, value: Vector) -> None:
     if len(value) != 3 or not all(math.isfinite(v) for v in value):
-        raise ValueError(f"{owner}.{name} is {value!r}, but must be three finite numbers")
+        raise InputError(f"{owner}.{name} is {value!r}, but must be three finite numbers")
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class Link:
         _check(owner, "mass", self.mass, 0.0, strict=True)
         _check_vector(owner, "axis", self.axis)
         if abs(math.hypot(*self.axis) - 1.0) > 1e-6:
-            raise ValueError(f"{owner}.axis is {self.axis!r}, but must have unit length")
+            raise InputError(f"{owner}.axis is {self.axis!r}, but must have unit length")
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,7 @@ class Motor:
         _check_vector("motor", "lower", self.lower)
         _check_vector("motor", "upper", self.upper)
         if any(low > high for low, high in zip(self.lower, self.upper, strict=True)):
-            raise ValueError(f"motor.lower is {self.lower!r}, but must not exceed motor.upper {self.upper!r}")
+            raise InputError(f"motor.lower is {self.lower!r}, but must not exceed motor.upper {self.upper!r}")
 
     def times(self, factor: float) -> Motor:
         """A motor so many times as strong, stiff and heavy."""
@@ -125,7 +127,7 @@ class Surface:
         """The surface whose free impact lasts `contact_time` [s] and returns `restitution` of the approach speed."""
         _check("surface", "contact_time", contact_time, 0.0, strict=True)
         if not 0.0 < restitution <= 1.0:
-            raise ValueError(f"surface.restitution is {restitution!r}, but must be in (0, 1]")
+            raise InputError(f"surface.restitution is {restitution!r}, but must be in (0, 1]")
         decay = -math.log(restitution) / contact_time
         frequency = math.pi / contact_time
         return Surface(frequency**2 + decay**2, 2.0 * decay, friction)
@@ -146,20 +148,20 @@ class Body:
 
     def __post_init__(self) -> None:
         if not self.links:
-            raise ValueError(f"body {self.name!r} has no links, but needs at least one")
+            raise InputError(f"body {self.name!r} has no links, but needs at least one")
         if len(self.joints) != len(self.links) - 1:
-            raise ValueError(
+            raise InputError(
                 f"body {self.name!r} has {len(self.joints)} joints, but its {len(self.links)} links need "
                 f"{len(self.links) - 1}"
             )
         for child, joint in enumerate(self.joints, start=1):
             if not 0 <= joint.parent < child:
-                raise ValueError(
+                raise InputError(
                     f"body {self.name!r}: the parent of link {child} is {joint.parent}, but must be in [0, {child})"
                 )
         names = [link.name for link in self.links]
         if len(set(names)) != len(names):
-            raise ValueError(f"body {self.name!r} has link names {names}, but they must differ")
+            raise InputError(f"body {self.name!r} has link names {names}, but they must differ")
 
     @property
     def is_ball(self) -> bool:
@@ -201,7 +203,7 @@ class Body:
         for index, link in enumerate(self.links):
             if link.name == name:
                 return index
-        raise ValueError(f"body {self.name!r} has no link {name!r}; it has {[link.name for link in self.links]}")
+        raise InputError(f"body {self.name!r} has no link {name!r}; it has {[link.name for link in self.links]}")
 
     def tied(self, one: str, other: str) -> bool:
         """Whether two links are the same, or one is the other's parent."""
@@ -246,19 +248,19 @@ class Scene:
         _check("scene", "gravity", self.gravity, 0.0, strict=False)
         names = [body.name for body in self.bodies]
         if not names or len(set(names)) != len(names):
-            raise ValueError(f"scene.bodies are named {names}, but need one or more different names")
+            raise InputError(f"scene.bodies are named {names}, but need one or more different names")
         met = [tuple(sorted((pair.first, pair.second))) for pair in self.pairs]
         if len(set(met)) != len(met):
-            raise ValueError(f"scene.pairs are of {met}, but two bodies may be named together once")
+            raise InputError(f"scene.pairs are of {met}, but two bodies may be named together once")
         for pair in self.pairs:
             for name, links in ((pair.first, pair.first_links), (pair.second, pair.second_links)):
                 if not links or len(set(links)) != len(links):
-                    raise ValueError(f"scene.pairs names the links {links} of {name!r}, but needs some, each once")
+                    raise InputError(f"scene.pairs names the links {links} of {name!r}, but needs some, each once")
                 for link in links:
                     self.body(name).link(link)
             for one, other in product(pair.first_links, pair.second_links):
                 if pair.of_itself and self.body(pair.first).tied(one, other):
-                    raise ValueError(
+                    raise InputError(
                         f"scene.pairs lets {one!r} and {other!r} of {pair.first!r} touch, but they are one link, or "
                         "tied by a joint"
                     )
@@ -268,7 +270,7 @@ class Scene:
         for body in self.bodies:
             if body.name == name:
                 return body
-        raise ValueError(f"scene has no body {name!r}; it has {[body.name for body in self.bodies]}")
+        raise InputError(f"scene has no body {name!r}; it has {[body.name for body in self.bodies]}")
 
     def rows(self, name: str) -> slice:
         """The rows of a body in the state."""
@@ -318,7 +320,7 @@ class Scene:
         """The scene with links of these lengths [m], radii [m] and masses [kg], (L, 3): see `Body.sized`."""
         sizes = np.asarray(morphology, float)
         if sizes.shape != (len(self.links), 3):
-            raise ValueError(f"morphology has shape {sizes.shape}, but needs ({len(self.links)}, 3)")
+            raise InputError(f"morphology has shape {sizes.shape}, but needs ({len(self.links)}, 3)")
         return replace(self, bodies=tuple(body.sized(sizes[self.rows(body.name)]) for body in self.bodies))
 
     @property

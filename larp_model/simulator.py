@@ -13,14 +13,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import ArrayLike, DTypeLike
 
 from larp_model import state as packed
 from larp_model import weights as stored
+from larp_model.errors import InputError
 from larp_model.kinematics import Kinematics, kinematics, morphology_of
 from larp_model.meeting import Velocities
 from larp_model.names import require_known
 from larp_model.networks import Weights
 from larp_model.parts.part import Hits, Model
+from larp_model.runtime import remember_compilations
 from larp_model.scene import Scene
 
 
@@ -75,8 +78,10 @@ class Simulator:
     def load(weights: str | Path, scene: Scene | None = None) -> Simulator:
         """The simulator of weights by their manifest, or of shipped ones by their name ("human_ball", "chains2", ...).
 
-        scene: that is to be simulated; what the weights were trained on by default.
+        scene: that is to be simulated; what the weights were trained on by default. What is compiled is kept from one
+        process to the next: see `runtime.remember_compilations`.
         """
+        remember_compilations()
         manifest = Path(weights)
         if manifest.name == str(weights) and not manifest.suffix:
             require_known("weights", str(weights), sorted(each.stem for each in stored.SHIPPED.glob("*.json")))
@@ -88,14 +93,17 @@ class Simulator:
         """What is simulated."""
         return self.model.scene
 
-    def step(self, state: Array, control: Array, torque: Array | None = None, morphology: Array | None = None) -> Array:
+    def step(
+        self, state: ArrayLike, control: ArrayLike, torque: ArrayLike | None = None,
+        morphology: ArrayLike | None = None,
+    ) -> Array:  # fmt: skip
         """States (N, L, 13) after one `scene.dt` under controls (N, J, 3) [rad]; see `rollout` for the rest."""
         given = self._checked(state, control, torque, morphology, ())
-        return _step(self.model, self.weights, *given)
+        return given[0] if given[0].shape[0] == 0 else _step(self.model, self.weights, *given)
 
     def rollout(
-        self, state: Array, controls: Array, torques: Array | None = None, morphology: Array | None = None,
-        steps: Array | None = None,
+        self, state: ArrayLike, controls: ArrayLike, torques: ArrayLike | None = None,
+        morphology: ArrayLike | None = None, steps: ArrayLike | None = None,
     ) -> Array:  # fmt: skip
         """States (N, H, L, 13) after each of H steps from states (N, L, 13) under controls (N, H, J, 3) [rad].
 
@@ -106,33 +114,42 @@ class Simulator:
         or 64 bits. Positions in 32 bits are 0.1 mm apart 1 km from the origin: plan near it.
         """
         given = self._checked(state, controls, torques, morphology, np.shape(controls)[1:2])
+        start, targets, *_ = given
+        if start.shape[0] == 0:
+            return jnp.zeros((0, targets.shape[1], *start.shape[1:]), start.dtype)
         states = _rollout(self.model, self.weights, *given, steps=steps)
         lost = jnp.cumsum(~packed.healthy(states), axis=1) > 0
         return jnp.where(lost[..., None, None], jnp.nan, states)
 
     def _checked(
-        self, state: Array, control: Array, torque: Array | None, morphology: Array | None, steps: tuple[int, ...]
-    ) -> tuple[Array, Array, Array | None, Array | None]:
+        self, state: ArrayLike, control: ArrayLike, torque: ArrayLike | None, morphology: ArrayLike | None,
+        steps: tuple[int, ...],
+    ) -> tuple[Array, Array, Array | None, Array | None]:  # fmt: skip
         """The public arguments as JAX arrays, refused by name where they do not fit; steps: (H,) or none."""
-        state, links, motors = jnp.asarray(state), len(self.scene.links), len(self.scene.motors)
-        if state.ndim != 3 or state.shape[1:] != (links, packed.SIZE):
-            raise ValueError(f"state has shape {state.shape}, but needs (N, {links}, {packed.SIZE})")
-        if state.dtype not in (jnp.float32, jnp.float64):
-            raise ValueError(f"state has numbers of type {state.dtype}, but needs float32 or float64")
-        needed = {
-            "controls": (control, (len(state), *steps, motors, 3)),
-            "torques": (torque, (len(state), *steps, links, 3)),
-        }
-        for name, (value, size) in needed.items():
-            if value is not None and np.shape(value) != size:
-                wanted = f"({len(state)}, {'H, ' if steps else ''}{size[-2]}, 3)"
-                raise ValueError(f"{name} have shape {np.shape(value)}, but need {wanted}")
-        if morphology is not None and np.shape(morphology) not in ((1, links, 3), (len(state), links, 3)):
-            raise ValueError(f"morphology has shape {np.shape(morphology)}, but needs ({len(state)} or 1, {links}, 3)")
-        torque, morphology = (
-            None if value is None else jnp.asarray(value, state.dtype) for value in (torque, morphology)
-        )
-        return state, jnp.asarray(control, state.dtype), torque, morphology
+        start, links, motors = _array("state", state), len(self.scene.links), len(self.scene.motors)
+        if start.ndim != 3 or start.shape[1:] != (links, packed.SIZE):
+            raise InputError(f"state has shape {start.shape}, but needs (N, {links}, {packed.SIZE})")
+        if start.dtype not in (jnp.float32, jnp.float64):
+            raise InputError(f"state has numbers of type {start.dtype}, but needs float32 or float64")
+        count, given = start.shape[0], list[Array | None]()  # the count may be a symbol: see `jax.export`
+        for name, value, rows in (("controls", control, motors), ("torques", torque, links)):
+            given.append(None if value is None else _array(name, value, start.dtype))
+            if given[-1] is not None and given[-1].shape != (count, *steps, rows, 3):
+                wanted = f"({count}, {'H, ' if steps else ''}{rows}, 3)"
+                raise InputError(f"{name} have shape {given[-1].shape}, but need {wanted}")
+        sizes = None if morphology is None else _array("morphology", morphology, start.dtype)
+        if sizes is not None and sizes.shape not in ((1, links, 3), (count, links, 3)):
+            raise InputError(f"morphology has shape {sizes.shape}, but needs ({count} or 1, {links}, 3)")
+        controls, torques = given
+        assert controls is not None
+        return start, controls, torques, sizes
+
+
+def _array(name: str, value: ArrayLike, dtype: DTypeLike | None = None) -> Array:
+    try:
+        return jnp.asarray(value, dtype)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} is of type {type(value).__name__}, but needs an array of numbers") from None
 
 
 def rollout(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -20,6 +20,7 @@ from jax import Array
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from larp_model import losses, rotation
+from larp_model.errors import InputError
 from larp_model.losses import LossWeights
 from larp_model.meeting import first_contacts
 from larp_model.networks import Weights
@@ -62,9 +63,9 @@ class Recipe:
     def __post_init__(self) -> None:
         for name in ("updates", "batch"):
             if getattr(self, name) < 1:
-                raise ValueError(f"recipe.{name} is {getattr(self, name)!r}, but must be at least 1")
+                raise InputError(f"recipe.{name} is {getattr(self, name)!r}, but must be at least 1")
         if abs(sum(share for _, share in self.curriculum) - 1.0) > 1e-6:
-            raise ValueError(f"recipe.curriculum is {self.curriculum!r}, but its shares must sum to 1")
+            raise InputError(f"recipe.curriculum is {self.curriculum!r}, but its shares must sum to 1")
 
     def unroll(self, update: int) -> int:
         """Steps unrolled at an update."""
@@ -74,6 +75,11 @@ class Recipe:
             if update < done:
                 return steps
         return self.curriculum[-1][0]
+
+    def split(self, networks: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Networks, by name, that are trained, and those that stay as they are."""
+        trained = {name: value for name, value in networks.items() if name.startswith(self.only or "")}
+        return trained, {name: value for name, value in networks.items() if name not in trained}
 
 
 class Progressed(NamedTuple):
@@ -114,7 +120,7 @@ class Windows:
             anywhere = random.integers(len(contacts), size=count - near)
             chosen = np.concatenate([struck[random.integers(len(struck), size=near)] if near else struck[:0], anywhere])
             if last < 0:
-                raise ValueError(f"episodes have {source.controls.shape[1]} steps, but the unroll needs {steps}")
+                raise InputError(f"episodes have {source.controls.shape[1]} steps, but the unroll needs {steps}")
             start = random.integers(last + 1, size=count)
             back = random.integers(-self.recipe.after_contact, self.recipe.before_contact + 1, size=near)
             start[:near] = np.clip(contacts[chosen[:near]] - back, 0, last)
@@ -171,38 +177,18 @@ def learning_rate(recipe: Recipe, update: int) -> float:
     return recipe.learning_rate * (recipe.final + (1.0 - recipe.final) * 0.5 * (1.0 + math.cos(math.pi * done)))
 
 
-def train(
-    model: Model,
-    recipe: Recipe,
-    sources: Sequence[tuple[Trajectories, float]],
-    folder: Path,
-    start: Weights | None = None,
-    quiet: bool = False,
-    seconds: float = math.inf,
-) -> tuple[Weights, dict[str, Any]]:
-    """Train on sources of (trajectories, share); returns the weights and a log of loss, norms and drops.
+Update = Callable[[dict[str, Any], Any, Array, Any, float | Array], tuple[dict[str, Any], Any, dict[str, Array]]]
+"""(trained networks, the optimiser's state, key, `Batch`, learning rate) -> both anew, and losses and norms by name."""
 
-    folder: where checkpoints are kept, and logs for TensorBoard; a run cut off there goes on from its last. start:
-    weights to go on from; what they lack begins fresh. seconds: only as many of the updates as fit into them, judged by
-    the first. Where a hundred batches in a row are dropped, the last good weights are returned and the log says so.
+
+def update_of(model: Model, recipe: Recipe, weights: Weights) -> Update:
+    """Return one step of gradient descent as a pure function; see `Update`.
+
+    Of `weights` the networks that are not trained and the statistics count. A batch whose gradient is not finite, or
+    beyond `recipe.drop`, changes nothing.
     """
-    from tensorboardX import SummaryWriter  # whose import sets a variable of the environment
-
-    random = np.random.default_rng(recipe.seed)
-    scene, windows = model.scene, Windows(model.scene, sources, recipe)
-    weights = begun(model, windows, random, start)
-    transform = optimiser(recipe)
-    fixed = {name: value for name, value in weights.networks.items() if not name.startswith(recipe.only or "")}
-    trained = {name: value for name, value in weights.networks.items() if name not in fixed}
-    progressed = Progressed(trained, transform.init(trained), 0)
-    manager = ocp.CheckpointManager(
-        (folder / "checkpoints").absolute(), options=ocp.CheckpointManagerOptions(max_to_keep=1, create=True)
-    )
-    if manager.latest_step() is not None:
-        restored = manager.restore(manager.latest_step(), args=ocp.args.StandardRestore((progressed, weights[1:])))
-        progressed, statistics = Progressed(*restored[0]), restored[1]
-        weights = Weights(fixed | progressed.networks, *statistics)
-    weigh = emphasis(scene, recipe)
+    scene, transform = model.scene, optimiser(recipe)
+    weigh, (_, fixed) = emphasis(scene, recipe), recipe.split(weights.networks)
 
     def loss_of(networks: dict[str, Any], states: Array, drawn: Any) -> tuple[Array, dict[str, Array]]:
         predicted = rollout(
@@ -211,7 +197,6 @@ def train(
         )  # fmt: skip
         return losses.total(scene, recipe.loss, weigh, predicted, states[:, 1:], drawn.morphology)
 
-    @partial(jax.jit, donate_argnums=(0, 1))
     def update(
         networks: dict[str, Any], state: Any, key: Array, drawn: Any, rate: float | Array
     ) -> tuple[dict[str, Any], Any, dict[str, Array]]:
@@ -232,6 +217,40 @@ def train(
             keep(new_state, state),
             terms | {"loss": loss, "norm": norm, "dropped": 1.0 - good},
         )
+
+    return update
+
+
+def train(
+    model: Model,
+    recipe: Recipe,
+    sources: Sequence[tuple[Trajectories, float]],
+    folder: Path,
+    start: Weights | None = None,
+    quiet: bool = False,
+    seconds: float = math.inf,
+) -> tuple[Weights, dict[str, Any]]:
+    """Train on sources of (trajectories, share); returns the weights and a log of loss, norms and drops.
+
+    folder: where checkpoints are kept, and logs for TensorBoard; a run cut off there goes on from its last. start:
+    weights to go on from; what they lack begins fresh. seconds: only as many of the updates as fit into them, judged by
+    the first. Where a hundred batches in a row are dropped, the last good weights are returned and the log says so.
+    """
+    from tensorboardX import SummaryWriter  # whose import sets a variable of the environment
+
+    random = np.random.default_rng(recipe.seed)
+    windows = Windows(model.scene, sources, recipe)
+    weights = begun(model, windows, random, start)
+    trained, fixed = recipe.split(weights.networks)
+    progressed = Progressed(trained, optimiser(recipe).init(trained), 0)
+    manager = ocp.CheckpointManager(
+        (folder / "checkpoints").absolute(), options=ocp.CheckpointManagerOptions(max_to_keep=1, create=True)
+    )
+    if manager.latest_step() is not None:
+        restored = manager.restore(manager.latest_step(), args=ocp.args.StandardRestore((progressed, weights[1:])))
+        progressed, statistics = Progressed(*restored[0]), restored[1]
+        weights = Weights(fixed | progressed.networks, *statistics)
+    update = jax.jit(update_of(model, recipe, weights), donate_argnums=(0, 1))
 
     log: dict[str, Any] = {"history": [], "dropped": 0, "stopped_early": False, "seconds": 0.0}
     in_a_row, recent, begin, saved = 0, [], time.perf_counter(), time.perf_counter()

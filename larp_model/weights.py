@@ -19,6 +19,7 @@ from safetensors.numpy import save as serialise
 
 from larp_model import mechanics, meeting
 from larp_model import state as packed
+from larp_model.errors import InputError
 from larp_model.files import write_whole
 from larp_model.names import require_file
 from larp_model.networks import Size, Statistics, Weights
@@ -167,9 +168,9 @@ def load(manifest: Path, scene: Scene | None, partly: bool = False) -> tuple[Mod
         parts = [decode(part) for part in content["parts"]] if known else []
         trained = trained_sizes(content) if known else {}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"weights manifest {manifest} cannot be read: {type(error).__name__}: {error}") from None
+        raise InputError(f"weights manifest {manifest} cannot be read: {type(error).__name__}: {error}") from None
     if not known:
-        raise ValueError(f"weights {manifest} are of version {version!r}, but {VERSION} is needed")
+        raise InputError(f"weights {manifest} are of version {version!r}, but {VERSION} is needed")
     scene = scene or scene_of(parts)
     if partly:
         names = {name_of(*bodies_of(part)) for part in parts}
@@ -178,14 +179,15 @@ def load(manifest: Path, scene: Scene | None, partly: bool = False) -> tuple[Mod
         scene = dataclasses.replace(scene, pairs=kept)
     try:
         model = assemble(scene, parts)
-    except ValueError as error:
-        raise ValueError(f"weights {manifest}: {error}; train some with `python -m tasks.train`") from None
+    except InputError as error:
+        train = "train some with `python -m tasks.train --scene NAME`, or FILE.py:NAME for a scene of your own"
+        raise InputError(f"weights {manifest}: {error}; {train}") from None
     for part in parts:
         for difference in differences(part, scene, trained):
-            raise ValueError(f"weights {manifest} do not fit the scene: {difference}")
+            raise InputError(f"weights {manifest} do not fit the scene: {difference}")
     raw = tensors_path.read_bytes()
     if hashlib.sha256(raw).hexdigest() != expected:
-        raise ValueError(f"weights file {tensors_path} is damaged: its sha256 is not the one in {manifest.name}")
+        raise InputError(f"weights file {tensors_path} is damaged: its sha256 is not the one in {manifest.name}")
     wanted = model.networks()
     arrays = {name: array for name, array in parse(raw).items() if name.split(":")[1] in wanted}
     _check_shapes(tensors_path, arrays, shapes(model))
@@ -293,8 +295,8 @@ def shapes(model: Model) -> dict[str, tuple[int, ...]]:
 def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray], needed: Mapping[str, tuple[int, ...]]) -> None:
     if set(arrays) != set(needed):
         odd = sorted(set(arrays) ^ set(needed))
-        raise ValueError(f"weights file {path} and its manifest differ in the tensors {odd}")
+        raise InputError(f"weights file {path} and its manifest differ in the tensors {odd}")
     for name, shape in needed.items():
         found = arrays[name].shape
         if found != shape:
-            raise ValueError(f"weights file {path}: {name} has shape {found}, but its part needs {shape}")
+            raise InputError(f"weights file {path}: {name} has shape {found}, but its part needs {shape}")

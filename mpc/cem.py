@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from larp_model.errors import InputError
 from mpc.search import COLOUR, Problem, Search, best_first, coloured_noise
 
 
@@ -40,10 +41,10 @@ class CEM:
         least_of = {"rounds": 1, "elites": 2, "samples": 2 * self.elites, "decay": 1, "exponent": 0}
         for name, least in least_of.items():
             if not least <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: got {getattr(self, name)}, needs a finite number >= {least}")
+                raise InputError(f"{name}: got {getattr(self, name)}, needs a finite number >= {least}")
         for name in ("keep", "momentum", "floor"):
             if not 0 <= getattr(self, name) < 1:
-                raise ValueError(f"{name}: got {getattr(self, name)}, needs a share in [0, 1)")
+                raise InputError(f"{name}: got {getattr(self, name)}, needs a share in [0, 1)")
 
     @property
     def sizes(self) -> tuple[int, ...]:

@@ -2,11 +2,14 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from larp_model.errors import InputError
 
 Residual = Callable[[jax.Array, jax.Array, Any], jax.Array]
 Norm = Callable[[jax.Array], jax.Array]
@@ -20,13 +23,21 @@ def quadratic(residual: jax.Array) -> jax.Array:
 def l2(width: float) -> Norm:
     """Length of each vector, (*, R) -> (*), rounded to a parabola below `width` (residual's unit)."""
     _require_width(width)
-    return lambda residual: jnp.sqrt(jnp.sum(residual**2, axis=-1) + width**2) - width
+    return partial(_rounded_length, width=width)
 
 
 def absolute(width: float) -> Norm:
     """Sum of the absolute components, (*, R) -> (*), each rounded off below `width` (residual's unit)."""
     _require_width(width)
-    return lambda residual: jnp.sum(jnp.sqrt(residual**2 + width**2) - width, axis=-1)
+    return partial(_rounded_sum, width=width)
+
+
+def _rounded_length(residual: jax.Array, width: float) -> jax.Array:
+    return jnp.sqrt(jnp.sum(residual**2, axis=-1) + width**2) - width
+
+
+def _rounded_sum(residual: jax.Array, width: float) -> jax.Array:
+    return jnp.sum(jnp.sqrt(residual**2 + width**2) - width, axis=-1)
 
 
 @dataclass(frozen=True)
@@ -57,7 +68,7 @@ def residuals(
     found = {term.name: term.residual(states, controls, context) for term in terms}
     for name, residual in found.items():
         if residual.ndim not in (1, 2):
-            raise ValueError(f"residual of {name!r}: got shape {residual.shape}, needs (R,) or (T, R)")
+            raise InputError(f"residual of {name!r}: got shape {residual.shape}, needs (R,) or (T, R)")
     return {name: residual + (corrections or {}).get(name, 0.0) for name, residual in found.items()}
 
 
@@ -131,9 +142,9 @@ def nearest_on_path(path: Any, point: Any) -> tuple[Any, Any]:
 def require_weight(name: str, weight: float) -> None:
     """Refuses a weight that is negative or not finite."""
     if not (np.isfinite(weight) and weight >= 0):
-        raise ValueError(f"weight of {name!r}: got {weight}, needs a finite number >= 0")
+        raise InputError(f"weight of {name!r}: got {weight}, needs a finite number >= 0")
 
 
 def _require_width(width: float) -> None:
     if not (np.isfinite(width) and width > 0):
-        raise ValueError(f"width: got {width}, needs a finite number > 0 for a gradient at zero")
+        raise InputError(f"width: got {width}, needs a finite number > 0 for a gradient at zero")

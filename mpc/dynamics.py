@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from larp_model.errors import InputError
+
 
 class Dynamics(Protocol):
     """A model of the scene; the learned simulator and the truth simulator both are one."""
@@ -79,7 +81,7 @@ class Continued:
 
     def __post_init__(self) -> None:
         if self.steps < 1:
-            raise ValueError(f"steps: got {self.steps}, needs at least 1")
+            raise InputError(f"steps: got {self.steps}, needs at least 1")
 
     @property
     def differentiable(self) -> bool:

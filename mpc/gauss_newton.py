@@ -6,6 +6,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from larp_model.errors import InputError
 from mpc.search import COLOUR, Problem, Residuals, Search, Tried, coloured_noise, merged
 
 # Dampings of a round, tried side by side, as multiples of the last one that served best.
@@ -55,12 +56,12 @@ class GaussNewton:
     def __post_init__(self) -> None:
         for name, least in {"rounds": 1, "directions": 1, "elites": 1}.items():
             if getattr(self, name) < least:
-                raise ValueError(f"{name}: got {getattr(self, name)}, needs at least {least}")
+                raise InputError(f"{name}: got {getattr(self, name)}, needs at least {least}")
         for name in ("step", "damping"):
             if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: got {getattr(self, name)}, needs a finite number > 0")
+                raise InputError(f"{name}: got {getattr(self, name)}, needs a finite number > 0")
         if self.jacobian not in ("forward", "differences"):
-            raise ValueError(f"jacobian: got {self.jacobian!r}, needs 'forward' or 'differences'")
+            raise InputError(f"jacobian: got {self.jacobian!r}, needs 'forward' or 'differences'")
 
     @property
     def differentiates(self) -> bool:

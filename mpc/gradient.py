@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from larp_model.errors import InputError
 from mpc.search import Problem, Search, best_first
 
 # Of RMSprop: share of the old mean square in the new, and what is added to it.
@@ -39,10 +40,10 @@ class Gradient:
     def __post_init__(self) -> None:
         for name in ("steps", "elites"):
             if getattr(self, name) < 1:
-                raise ValueError(f"{name}: got {getattr(self, name)}, needs at least 1")
+                raise InputError(f"{name}: got {getattr(self, name)}, needs at least 1")
         for name in ("learning_rate", "clip"):
             if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: got {getattr(self, name)}, needs a finite number > 0")
+                raise InputError(f"{name}: got {getattr(self, name)}, needs a finite number > 0")
 
     def improve(self, search: Search, _random: np.random.Generator, problem: Problem) -> Search:
         """All steps: every candidate is tried before each of them and after the last."""

@@ -22,7 +22,7 @@ class World(Protocol):
         """States (1, L, 13) after one step under joint targets (1, J, 3) [rad]; NaN where it diverged."""
 
 
-class Diverged(ValueError):
+class Diverged(RuntimeError):
     """The world's state is no longer finite: nothing that was executed from here on would mean anything."""
 
 

@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from larp_model.errors import InputError
 from mpc.search import COLOUR, Problem, Search, coloured_noise, merged
 
 
@@ -32,7 +33,7 @@ class MPPI:
         least_of = {"samples": 2, "rounds": 1, "elites": 1, "temperature": 1e-6, "exponent": 0}
         for name, least in least_of.items():
             if not least <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: got {getattr(self, name)}, needs a finite number >= {least:g}")
+                raise InputError(f"{name}: got {getattr(self, name)}, needs a finite number >= {least:g}")
 
     def improve(self, search: Search, random: np.random.Generator, problem: Problem) -> Search:
         """All rounds, and the last mean tried."""

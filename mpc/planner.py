@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from larp_model.errors import InputError
+from larp_model.runtime import remember_compilations
 from mpc.cost import CostTerm, require_weight
 from mpc.dynamics import Dynamics
 from mpc.problem import Equations, PlannerProblem, Programs, Wanted
@@ -62,7 +64,8 @@ class Planner:
     plan starts from the last one's spread, widened towards the first by the share `reheat`. `lower` and
     `upper` (J, 3) [rad] bound the targets. `dt` [s] is the control step. What the model does is compiled once for each
     set of argument shapes and each number of candidates, and shared with the planners that `using` makes: a moving
-    target, weight or reference compiles nothing again.
+    target, weight or reference compiles nothing again, and other processes compile nothing again either: see
+    `runtime.remember_compilations`.
     """
 
     def __init__(
@@ -79,6 +82,7 @@ class Planner:
         interpolation: Interpolation = "cubic",
         reheat: float = 0.5,
     ) -> None:
+        remember_compilations()
         self.dynamics = dynamics
         self.terms = tuple(terms)
         self.horizon = horizon
@@ -86,13 +90,13 @@ class Planner:
         self.reheat = reheat
         self.scale = np.asarray(spread, np.float32)
         if self.scale.ndim != 2 or self.scale.shape[1] != 3:
-            raise ValueError(f"spread: got shape {self.scale.shape}, needs (J, 3)")
+            raise InputError(f"spread: got shape {self.scale.shape}, needs (J, 3)")
         self.lower = _broadcast("lower", lower, self.scale.shape)
         self.upper = _broadcast("upper", upper, self.scale.shape)
         if not 2 <= knots <= horizon:
-            raise ValueError(f"knots: got {knots}, needs 2 to horizon ({horizon})")
+            raise InputError(f"knots: got {knots}, needs 2 to horizon ({horizon})")
         if not (np.isfinite(dt) and dt > 0):
-            raise ValueError(f"dt: got {dt}, needs a finite number > 0")
+            raise InputError(f"dt: got {dt}, needs a finite number > 0")
         self._check()
         self.control_times = dt * np.arange(horizon, dtype=np.float32)
         self.knot_times = np.linspace(0, self.control_times[-1], knots, dtype=np.float32)
@@ -102,6 +106,14 @@ class Planner:
         )
         self._controls = jax.jit(self._equations.controls)
         self._use(optimizers)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what is compiled: copies, and other processes, compile their own."""
+        return {name: value for name, value in self.__dict__.items() if name != "_controls"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._controls = jax.jit(self._equations.controls)
 
     def using(self, optimizers: Optimizer | Sequence[Optimizer]) -> Planner:
         """A planner of the same problem with other optimisers, which shares all that is compiled."""
@@ -115,14 +127,14 @@ class Planner:
             tuple(optimizers) if isinstance(optimizers, Sequence) else (optimizers,)
         )
         if not self.optimizers:
-            raise ValueError("optimizers: got none, needs at least one")
+            raise InputError("optimizers: got none, needs at least one")
         for each in self.optimizers:
             if each.differentiates and not self.dynamics.differentiable:
                 names = type(each).__name__, type(self.dynamics).__name__
-                raise ValueError("optimizers: got {}, needs differentiable dynamics, not {}".format(*names))
+                raise InputError("optimizers: got {}, needs differentiable dynamics, not {}".format(*names))
         for each in self.optimizers[:-1]:
             if getattr(each, "settles", False):
-                raise ValueError(f"optimizers: got {type(each).__name__} before another, needs it last")
+                raise InputError(f"optimizers: got {type(each).__name__} before another, needs it last")
         self.elites = max(optimizer.elites for optimizer in self.optimizers)
 
     def init(self, key: jax.Array, now: float = 0.0) -> Plan:
@@ -159,7 +171,7 @@ class Planner:
             search = optimizer.improve(search, random, problem)
             if len(search.elites) != self.elites:
                 name = type(optimizer).__name__
-                raise ValueError(f"optimizers: got {len(search.elites)} elites from {name}, needs {self.elites}")
+                raise InputError(f"optimizers: got {len(search.elites)} elites from {name}, needs {self.elites}")
         known = np.isfinite(search.costs)[:, None, None, None]
         after = Plan(np.where(known, search.elites, search.elites[0]), search.spread, np.float32(now), _entropy(random))
         states = problem.states_of(after.knots)
@@ -247,21 +259,21 @@ class Planner:
         """The public arguments, checked, as arrays of fixed shape and type."""
         state = np.asarray(state, np.float32)
         if state.ndim != 2 or state.shape[1] != 13:
-            raise ValueError(f"state: got shape {state.shape}, needs (L, 13)")
+            raise InputError(f"state: got shape {state.shape}, needs (L, 13)")
         if not np.isfinite(state).all():
-            raise ValueError("state: got numbers that are not finite, needs all of them finite")
+            raise InputError("state: got numbers that are not finite, needs all of them finite")
         knots = (len(self.knot_times), *self.scale.shape)
         if plan.knots.shape != knots:
-            raise ValueError(f"plan: got knots {plan.knots.shape}, needs {knots}; it is another problem's")
+            raise InputError(f"plan: got knots {plan.knots.shape}, needs {knots}; it is another problem's")
         start = float(plan.start)  # of a clock in 32 bits, hence the tolerance
         if not start - 1e-4 * max(1.0, abs(start)) <= now < np.inf:
-            raise ValueError(f"now: got {now} s, needs a time from plan.start, {start} s, on")
+            raise InputError(f"now: got {now} s, needs a time from plan.start, {start} s, on")
         if steps is not None and not 1 <= steps <= self.horizon:
-            raise ValueError(f"steps: got {steps}, needs 1 to horizon ({self.horizon})")
+            raise InputError(f"steps: got {steps}, needs 1 to horizon ({self.horizon})")
         current = {term.name: float(term.weight) for term in self.terms}
         for name, weight in (weights or {}).items():
             if name not in current:
-                raise ValueError(f"weights: got {name!r}, needs names of cost terms: {', '.join(current)}")
+                raise InputError(f"weights: got {name!r}, needs names of cost terms: {', '.join(current)}")
             require_weight(name, weight)
             current[name] = float(weight)
         return Wanted(state, self._reference(reference), *jax.tree.map(_array, (context, current, steps)))
@@ -269,22 +281,22 @@ class Planner:
     def _reference(self, reference: ArrayLike) -> ArrayLike:
         shape = (self.horizon, *self.scale.shape)
         if np.shape(reference) != shape:
-            raise ValueError(f"reference: got shape {np.shape(reference)}, needs {shape}")
+            raise InputError(f"reference: got shape {np.shape(reference)}, needs {shape}")
         return reference if isinstance(reference, jax.core.Tracer) else _array(reference)
 
     def _check(self) -> None:
         """Refuses what would fail later, or silently, by the name of the argument."""
         if not (np.isfinite(self.scale).all() and (self.scale >= 0).all()):
-            raise ValueError(f"spread: got {self.scale.tolist()}, needs finite numbers >= 0")
+            raise InputError(f"spread: got {self.scale.tolist()}, needs finite numbers >= 0")
         if not (self.lower <= self.upper).all():
-            raise ValueError("lower: got values above upper, needs lower <= upper")
+            raise InputError("lower: got values above upper, needs lower <= upper")
         if self.interpolation not in ("linear", "cubic"):
-            raise ValueError(f"interpolation: got {self.interpolation!r}, needs 'linear' or 'cubic'")
+            raise InputError(f"interpolation: got {self.interpolation!r}, needs 'linear' or 'cubic'")
         if not 0 <= self.reheat <= 1:
-            raise ValueError(f"reheat: got {self.reheat}, needs a share in [0, 1]")
+            raise InputError(f"reheat: got {self.reheat}, needs a share in [0, 1]")
         names = [term.name for term in self.terms]
         if not names or len(set(names)) < len(names):
-            raise ValueError(f"terms: got {names}, needs at least one, each with its own name")
+            raise InputError(f"terms: got {names}, needs at least one, each with its own name")
 
 
 def _entropy(random: np.random.Generator) -> np.ndarray:
@@ -304,4 +316,4 @@ def _broadcast(name: str, value: ArrayLike, shape: tuple[int, ...]) -> np.ndarra
     try:
         return np.broadcast_to(array, shape)
     except ValueError:
-        raise ValueError(f"{name}: got shape {array.shape}, needs {shape}") from None
+        raise InputError(f"{name}: got shape {array.shape}, needs {shape}") from None

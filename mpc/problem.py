@@ -103,6 +103,10 @@ class Programs:
         self.seconds = 0.0
         self._compiled: dict[Any, Any] = {}
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Copies begin without compiled programs, which cannot be copied."""
+        return self.__dict__ | {"_compiled": {}}
+
     def __call__(self, name: Any, function: Callable[..., Any], *arguments: Any) -> Any:
         """What the function gives, finished, compiled first where needed; `name` stands for the function."""
         leaves, structure = jax.tree.flatten(arguments)

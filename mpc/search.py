@@ -7,9 +7,11 @@ optimisers and planners of a problem share.
 from __future__ import annotations
 
 import functools
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+
+from larp_model.errors import InputError
 
 # Colour of the noise where an optimiser does not say it.
 COLOUR = 2.0
@@ -74,6 +76,7 @@ class Problem(Protocol):
         """The same problem with something added to the residuals of every candidate, (1, ...) by term."""
 
 
+@runtime_checkable
 class Optimizer(Protocol):
     """A way to better candidates: whatever is given, what comes out is no worse. Its fields are its settings.
 
@@ -96,14 +99,14 @@ def require_enough(enough: Enough) -> None:
     """Refuses lengths that are none."""
     for name, length in enough:
         if not 0.0 <= length < np.inf:
-            raise ValueError(f"enough: got {length} for {name!r}, needs a finite number >= 0")
+            raise InputError(f"enough: got {length} for {name!r}, needs a finite number >= 0")
 
 
 def suffices(enough: Enough, cost: float, residuals: Residuals) -> bool:
     """Whether one candidate, of this cost and residuals (1, ...), is good enough."""
     for name, _ in enough:
         if name not in residuals:
-            raise ValueError(f"enough: got {name!r}, needs names of cost terms: {', '.join(residuals)}")
+            raise InputError(f"enough: got {name!r}, needs names of cost terms: {', '.join(residuals)}")
     short = [np.linalg.norm(residuals[name]) <= length for name, length in enough]
     return bool(short) and bool(np.isfinite(cost)) and all(short)
 

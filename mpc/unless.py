@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from larp_model.errors import InputError
 from mpc.search import Enough, Optimizer, Problem, Search, require_enough, suffices
 
 
@@ -23,10 +24,10 @@ class Unless:
     def __post_init__(self) -> None:
         require_enough(self.enough)
         if not (self.enough and self.optimizers):
-            raise ValueError(f"enough, optimizers: got {self.enough}, {self.optimizers}, needs some of both")
+            raise InputError(f"enough, optimizers: got {self.enough}, {self.optimizers}, needs some of both")
         for each in self.optimizers:
             if getattr(each, "settles", False):
-                raise ValueError(f"optimizers: got {type(each).__name__}, which must come last of all")
+                raise InputError(f"optimizers: got {type(each).__name__}, which must come last of all")
 
     @property
     def differentiates(self) -> bool:

@@ -7,6 +7,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from larp_model.errors import InputError
 from mpc.dynamics import Dynamics
 from mpc.search import Enough, Optimizer, Problem, Residuals, Search, distinct, merged, require_enough, suffices
 
@@ -49,7 +50,7 @@ class Verified:
     def __post_init__(self) -> None:
         for name, least in {"rounds": 1, "candidates": 1}.items():
             if getattr(self, name) < least:
-                raise ValueError(f"{name}: got {getattr(self, name)}, needs at least {least}")
+                raise InputError(f"{name}: got {getattr(self, name)}, needs at least {least}")
         require_enough(self.enough)
 
     @property

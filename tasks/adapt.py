@@ -21,6 +21,7 @@ from larp_model import evaluation, training
 from larp_model import weights as stored
 from larp_model.anatomy import Detail
 from larp_model.bodies import human_and_ball
+from larp_model.errors import InputError
 from larp_model.files import require_writable
 from larp_model.names import require_file
 from larp_model.networks import Weights
@@ -28,7 +29,7 @@ from larp_model.parts.part import Model
 from larp_model.simulator import Simulator
 from larp_model.truth import episodes as truth_episodes
 from larp_model.truth.episodes import Episodes
-from tasks.command import remember_compilations, run
+from tasks.command import prepare_jax, run
 from tasks.data import STEPS, WINDOWS, contact_episodes, random_episodes
 from tasks.kick import Kick
 from tasks.scenarios import ANY_HUMAN
@@ -123,11 +124,11 @@ def main(
     """
     begin = time.perf_counter()
     if not (math.isfinite(minutes) and minutes >= LEAST):
-        raise ValueError(f"minutes is {minutes:g}, but must be at least {LEAST:g}: nothing is learned in less")
+        raise InputError(f"minutes is {minutes:g}, but must be at least {LEAST:g}: nothing is learned in less")
     if reference is not None:
         require_file("reference", reference)
     require_writable(out, "out")
-    remember_compilations()
+    prepare_jax()
     console, whole = Console(), 60.0 * minutes
 
     def tell(what: str) -> None:

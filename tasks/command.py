@@ -2,39 +2,115 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import json as text
 import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from typing import Any, NoReturn, TextIO
 
-import jax
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from larp_model.errors import InputError
+from larp_model.runtime import remember_compilations, require_device
+from mpc.loop import Diverged
+
+# What a write fails with on a disk that takes no more.
+DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
+
 
 def run(task: Callable[..., None] | dict[str, Callable[..., None]], arguments: list[str] | None = None) -> None:
-    """The command line of a task, or of several by name: wrong values end it with one line and exit code 2."""
-    try:
-        if isinstance(task, dict):
-            tyro.extras.subcommand_cli_from_dict(task, args=arguments)
-        else:
-            tyro.cli(task, args=arguments)
-    except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
+    """Run the command line of a task, or of several by name, and end the process as its user expects.
+
+    One line on stderr and exit code 2 for input that cannot be used, 1 where a disk takes no more, the world
+    diverged or stdout could not be written; 130 after Ctrl-C. Any other exception is a defect and keeps its traceback.
+    A command outlives who reads its output: see `Stream`.
+    """
+    out, err = Stream(sys.stdout), Stream(sys.stderr)
+    with redirect_stdout(out), redirect_stderr(err):  # type: ignore[type-var]
+        try:
+            if isinstance(task, dict):
+                tyro.extras.subcommand_cli_from_dict(task, args=arguments)
+            else:
+                tyro.cli(task, args=arguments)
+        except InputError as error:
+            _end(2, str(error))
+        except Diverged as error:
+            _end(1, str(error))
+        except KeyboardInterrupt:
+            _end(130, "interrupted")
+        except OSError as error:
+            if error.errno not in DISK:
+                raise
+            _end(1, f"{error.filename or 'a file'} cannot be written: {error.strerror}")
+        out.flush()
+        if out.failure is not None and not isinstance(out.failure, BrokenPipeError):
+            _end(1, f"stdout cannot be written: {out.failure.strerror}")
 
 
-def remember_compilations() -> None:
-    """Keep compiled planners in the user's cache folder, so that the second run starts at once."""
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    jax.config.update("jax_compilation_cache_dir", str(base / "larp-mpc"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+def _end(code: int, reason: str) -> NoReturn:
+    print(f"error: {reason}", file=sys.stderr)
+    raise SystemExit(code) from None
+
+
+def prepare_jax() -> None:
+    """Get JAX ready for a command, once its arguments are checked: a device that exists, a kept compilation cache."""
+    require_device()
+    remember_compilations()
+
+
+class Stream(io.TextIOBase):
+    """Standard output or error that never stops the program: silent from the first failed write on.
+
+    A reader may leave (`| head -1`) and a disk may be full; `failure` then says why. What the terminal's encoding lacks
+    is shown as "?".
+    """
+
+    def __init__(self, stream: TextIO | None) -> None:
+        """stream: None where the process was started without one."""
+        self._stream = stream if stream is not None else open(os.devnull, "w")  # noqa: SIM115 as long as the process
+        self.failure: OSError | None = None
+        if isinstance(self._stream, io.TextIOWrapper):
+            self._stream.reconfigure(errors="replace")
+
+    @property
+    def encoding(self) -> str:  # type: ignore[override]
+        """The terminal's."""
+        return self._stream.encoding
+
+    def write(self, text: str) -> int:
+        """Write text, or drop it after a failure."""
+        self._try(lambda: self._stream.write(text))
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush, or do nothing after a failure."""
+        self._try(self._stream.flush)
+
+    def isatty(self) -> bool:
+        """Whether a person reads along."""
+        return self._stream.isatty()
+
+    def fileno(self) -> int:
+        """The file descriptor."""
+        return self._stream.fileno()
+
+    def _try(self, action: Callable[[], object]) -> None:
+        if self.failure is not None:
+            return
+        try:
+            action()
+        except OSError as error:
+            self.failure = error
+            # What is still buffered goes where it does not fail, or the interpreter complains at its exit.
+            with suppress(OSError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
 
 
 class Teller:
@@ -53,7 +129,11 @@ class Teller:
         """Say that a part begins and, when it ends, how long it took."""
         begin = time.perf_counter()
         self._console.print(f"{what} ...", end=" ")
-        yield
+        try:
+            yield
+        except BaseException:
+            self._console.print()
+            raise
         self._console.print(f"{time.perf_counter() - begin:.1f} s")
 
     @contextmanager

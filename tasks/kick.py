@@ -16,23 +16,23 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from jax import Array
 
 from larp_model import state as packed
 from larp_model.anatomy import Detail
+from larp_model.errors import InputError
 from larp_model.files import require_writable
 from larp_model.names import require_file
 from larp_model.truth.mujoco import FINE_SUBSTEPS, Truth
-from mpc import CostTerm, l2, nearest_on_path, quadratic
+from mpc import CostTerm, l2, quadratic
 from mpc.loop import Execution
 from tasks import residuals
-from tasks.command import Teller, remember_compilations, run
+from tasks.command import Teller, prepare_jax, run
 from tasks.gap import contact_step, gap, told
 from tasks.live import Choices, Live, weights_for
 from tasks.models import DynamicsName
 from tasks.presets import PRESETS, PresetName, changed, preset_of
 from tasks.task import AFTER_CONTACT, HEIGHT, REACHABLE, Run, Task, checked_target
-from viewer import LivePage, Wishes, check_film, nearest_approach, write_film
+from viewer import LivePage, Wishes, check_film, nearest_approach, require_address, write_film
 
 Pair = np.ndarray | tuple[float, float]
 # A target (3,) [m] like others: straight ahead.
@@ -47,11 +47,7 @@ class Kick(Task):
     @property
     def goals(self) -> tuple[CostTerm, ...]:
         """See `Task`."""
-
-        def target(states: Array, controls: Array, context: Any) -> Array:
-            nearest, _ = nearest_on_path(states[:, self.ball, packed.POSITION], context["goal"])
-            return nearest - context["goal"]
-
+        target = partial(residuals.miss, ball=self.ball)
         find_ball = partial(residuals.apart, link=self.foot, other=self.ball)
         return CostTerm("target", target, l2(0.05), 10.0), CostTerm("find_ball", find_ball, quadratic, 5.0)
 
@@ -72,6 +68,9 @@ class Kick(Task):
 
         ball_velocity: (2,) [m/s], with which it rolls so that it passes that place when the reference strikes.
         """
+        for name, value in (("ball_offset", ball_offset), ("ball_velocity", ball_velocity)):
+            if np.shape(value) != (2,) or not np.isfinite(value).all():
+                raise InputError(f"{name} is {value}, but must be two finite numbers")
         state = self.reference.states[0].copy()
         ball = state[self.ball]
         ball[:2] += ball_offset
@@ -159,6 +158,7 @@ def main(
     view: bool = False,
     host: str = "127.0.0.1",
     port: int = 8080,
+    allow_host: tuple[str, ...] = (),
     video: Path | None = None,
     quiet: bool = False,
     json: bool = False,
@@ -182,6 +182,7 @@ def main(
         view: show the kick live in the browser; there, set what you like and kick again.
         host: of the page; others can use it where they reach the host.
         port: of the page.
+        allow_host: names of hosts by which a proxy before the page is reached, such as hub.example.org.
         video: a film of the kick to write: FILE.mp4 or FILE.gif.
         quiet: print nothing.
         json: print the summary as JSON, and on stderr what else is told.
@@ -194,7 +195,9 @@ def main(
     if video is not None:
         check_film(video)
         require_writable(video.parent, "video")
-    remember_compilations()
+    if view:
+        require_address(host, port, allow_host)
+    prepare_jax()
     tell = Teller(quiet, json)
     with tell.part("setting up"):
         kick = Kick.standard(reference, height, mass, body, self_contact, names)
@@ -202,9 +205,9 @@ def main(
     called = " ".join((preset, *change))
 
     def finished(kicked: Run) -> None:
-        tell.result(kicked.table, kicked.summary)
         with tell.part("writing"):
             kicked.save(out)
+        tell.result(kicked.table, kicked.summary)
         if video is not None:
             with tell.part(f"filming {video}"):
                 write_film(kicked.recording, video)
@@ -226,7 +229,7 @@ def main(
         tasks["embedded"] = lambda: Kick.standard(None, height, mass, body, self_contact)
     models = (dynamics, *(each for each in get_args(DynamicsName) if each != dynamics))
     choices = Choices(tasks, {called: chosen} | PRESETS, models, weights_for(kick, weights))
-    with LivePage(host, port, choices.offer(kick)) as page:
+    with LivePage(host, port, choices.offer(kick), allow_host) as page:
         tell(f"watch it at {page.address} (Ctrl-C ends)")
         Live(page, choices, goal, out / "kept", seed, wished, finished).serve("kick")
 

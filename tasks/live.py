@@ -18,9 +18,10 @@ import numpy as np
 
 from larp_model import state as packed
 from larp_model import weights as stored
+from larp_model.errors import InputError
 from larp_model.scene import Scene
 from larp_model.truth.mujoco import Truth
-from mpc.loop import Execution, Replan, Window
+from mpc.loop import Diverged, Execution, Replan, Window
 from tasks.models import DynamicsName, Models
 from tasks.presets import Preset
 from tasks.task import REACHABLE, Planners, Run, Task
@@ -69,7 +70,7 @@ def weights_for(task: Task, chosen: Path | None) -> dict[str, Path]:
     for path in (chosen or task.weights, *sorted(stored.SHIPPED.glob("*.json"))):
         try:
             stored.load(path, task.scene)
-        except ValueError:
+        except InputError:
             continue
         known.setdefault(path.stem, path)
     return known
@@ -246,7 +247,7 @@ class Live:
             else:
                 self.plan()
             return
-        except ValueError as error:  # the world diverged, or no candidate was finite
+        except (Diverged, InputError) as error:
             self.page.tell(f"**Ended:** {error}")
             return
         self.errors.append((self.run.truth_error_m, self.run.model_error_m))
@@ -292,7 +293,7 @@ class Live:
                 self.page.tell("**Setting up** what is new: the first plan compiles, for some seconds.")
             self.planners(wishes)
             return self.task(wishes.reference)
-        except ValueError as error:
+        except InputError as error:
             self.page.tell(f"**Not possible:** {error}")
             return None
 
@@ -300,7 +301,7 @@ class Live:
         """Whether a run could be written; says why not."""
         try:
             save(run)
-        except (OSError, ValueError) as error:
+        except (OSError, InputError) as error:
             self.page.tell(f"**Not written:** {error}")
             return False
         return True
@@ -343,7 +344,7 @@ class Live:
         elif (name := page.panel.chosen(list(self.kept))) is not None and ask in ("open", "beside"):
             try:
                 found = opened(self.task(page.wishes.reference), self.kept[name])
-            except ValueError as error:
+            except InputError as error:
                 page.tell(f"**Cannot be opened:** {name}: {error}")
                 return
             other = page.recording if ask == "beside" else None
@@ -366,14 +367,14 @@ class Interrupted(Exception):
 
 
 def opened(task: Task, folder: Path) -> Recording:
-    """The recording of a kick that was saved. Raises ValueError where it is of another scene, or damaged."""
+    """The recording of a kick that was saved. Raises InputError where it is of another scene, or damaged."""
     try:
         summary = json.loads((folder / "summary.json").read_text())
         with np.load(folder / f"{task.name}.npz", allow_pickle=False) as file:
             states, predicted, begun = (file[name] for name in ("states", "predicted_states", "plan_step"))
         goal, facts, before = task.asked(tuple(summary["target"])), task.facts(summary), states[int(begun)][None]
     except Exception as error:  # json, numpy and zipfile raise many kinds for a damaged file
-        raise ValueError(f"{folder.name} cannot be read: {type(error).__name__}: {error}") from None
+        raise InputError(f"{folder.name} cannot be read: {type(error).__name__}: {error}") from None
     return Recording(
         task.scene,
         states,

@@ -22,13 +22,14 @@ from scipy.spatial.transform import Rotation
 from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.bodies import human, standing_height
+from larp_model.errors import InputError
 from larp_model.files import require_writable, write_whole
 from larp_model.scene import Body, Scene
 from larp_model.simulator import Simulator
 from larp_model.truth.mujoco import SUBSTEPS, Truth
 from mpc import Dynamics, MujocoDynamics
 from mpc.loop import Begun, Execution
-from tasks.command import Teller, remember_compilations, run
+from tasks.command import Teller, prepare_jax, run
 from tasks.keypoints import camera as cameras
 from tasks.keypoints import figure as figures
 from tasks.keypoints import formats, lift, metrics, physical
@@ -68,7 +69,7 @@ def shown(keypoints: Keypoints) -> tuple[int, int]:
     """The first frame in which a person is seen, and the last; refuses what shows too little."""
     frames = np.flatnonzero((keypoints.confidence > 0.3).sum(axis=1) >= 6)
     if len(frames) < LEAST:
-        raise ValueError(f"keypoints show 6 or more points in {len(frames)} frames, but need {LEAST} such frames")
+        raise InputError(f"keypoints show 6 or more points in {len(frames)} frames, but need {LEAST} such frames")
     return int(frames[0]), int(frames[-1])
 
 
@@ -212,17 +213,17 @@ def main(
         json: print the summary as JSON, and on stderr what else is told.
     """
     if height is not None and not HEIGHTS[0] <= height <= HEIGHTS[1]:
-        raise ValueError(f"height is {height:g}, but must be from {HEIGHTS[0]:g} to {HEIGHTS[1]:g} m")
+        raise InputError(f"height is {height:g}, but must be from {HEIGHTS[0]:g} to {HEIGHTS[1]:g} m")
     require_writable(out, "out")
     loaded = formats.load(keypoints, rate, size, person)
     film = cut(loaded.keypoints)
     if camera is not None:
         lens, known = cameras.load(camera, film.size)
     elif film.size is None:
-        raise ValueError("size is not known, but the images' width and height are needed, or a camera file with them")
+        raise InputError("size is not known, but the images' width and height are needed, or a camera file with them")
     else:
         lens, known = cameras.held(cameras.focal_length(cameras.FIELD_OF_VIEW, film.size[0]), film.size), False
-    remember_compilations()
+    prepare_jax()
     tell = Teller(quiet, json)
     if loaded.crossed:
         tell(f"another person is before or behind this one in {loaded.crossed} frames: look at them in pose.png")
@@ -289,7 +290,6 @@ def main(
     )
     told.add_row("fell", "yes" if made.fell else "no")
     told.add_row("planning", f"{summary['plan_seconds']:.1f} s, {summary['candidates']} candidates")
-    tell.result(told, summary)
     buffer, motion = io.BytesIO(), angles_of(made.wanted.states if made.fell else made.states, made.body, DT)
     np.savez_compressed(buffer, **motion)
     write_whole(out / "pose.npz", buffer.getvalue())
@@ -298,6 +298,7 @@ def main(
     write_overlay(overlay_of(film, made), out / "pose.html")
     write_whole(out / "summary.json", (text.dumps(summary, indent=2) + "\n").encode())
     kept.done()
+    tell.result(told, summary)
     tell(f"{out}/: summary.json, pose.npz, pose.bvh, pose.png, pose.html")
 
 

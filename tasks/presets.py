@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, Literal, NamedTuple
 
+from larp_model.errors import InputError
 from larp_model.names import require_known
 from mpc import CEM, MPPI, Dynamics, GaussNewton, Gradient, Optimizer, Unless
 
@@ -40,6 +41,38 @@ class Preset:
     candidates: int = 1
     enough: float = 0.004
     stand: Stage = (STAND,)
+
+    def __post_init__(self) -> None:
+        for name in ("every", "candidates"):
+            if not (_whole(value := getattr(self, name)) and value >= 1):
+                raise InputError(f"{name} is {value!r}, but must be an integer of at least 1")
+        pair = self.verify
+        if not (isinstance(pair, tuple) and len(pair) == 2 and all(_whole(each) and each >= 0 for each in pair)):
+            raise InputError(f"verify is {pair!r}, but must be two integers of at least 0, of first plan and replans")
+        if not (isinstance(self.enough, int | float) and 0.0 <= self.enough < math.inf):
+            raise InputError(f"enough is {self.enough!r}, but must be a finite number of at least 0 [m]")
+        for name in ("first", "again", "stand"):
+            stage = getattr(self, name)
+            if not (isinstance(stage, tuple) and stage):
+                raise InputError(f"{name} is {stage!r}, but must be a tuple of at least one optimiser")
+            for each in stage:
+                if not isinstance(each, Optimizer):
+                    raise InputError(f"{name} holds {each!r}, which is no optimiser: see mpc.Optimizer")
+                if not _hashable(each):
+                    kind = type(each).__name__
+                    raise InputError(f"{name} holds a {kind} that cannot be hashed: make it a frozen dataclass")
+
+
+def _hashable(value: object) -> bool:
+    try:
+        hash(value)
+    except TypeError:
+        return False
+    return True
+
+
+def _whole(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
 
 
 def _found(rounds: int, around: int) -> Stage:
@@ -80,7 +113,7 @@ def changed(preset: Preset, changes: Sequence[str]) -> Preset:
         try:
             given = ast.literal_eval(value)
         except (ValueError, SyntaxError):
-            raise ValueError(f"change is {change!r}, but must be NAME=VALUE, its value a number or (a, b)") from None
+            raise InputError(f"change is {change!r}, but must be NAME=VALUE, its value a number or (a, b)") from None
         preset = _changed(preset, path.split("."), given, change)
     return preset
 
@@ -89,7 +122,7 @@ def _changed(part: Any, path: Sequence[str], value: Any, change: str) -> Any:
     if not path:
         kinds = (int, float) if isinstance(part, float) else (type(part),)
         if type(value) not in kinds or not isinstance(part, int | float | tuple | bool):
-            raise ValueError(f"change is {change!r}, but what it changes is {part!r}")
+            raise InputError(f"change is {change!r}, but what it changes is {part!r}")
         return value
     name, *rest = path
     if isinstance(part, tuple):
@@ -115,14 +148,14 @@ def within(preset: Preset, seconds: float, measure: Callable[[Preset], Seconds])
     astray is left out. measure: what a preset's plans take.
     """
     if not (math.isfinite(seconds) and seconds > 0.0):
-        raise ValueError(f"budget is {seconds}, but must be a finite number of seconds > 0")
+        raise InputError(f"budget is {seconds}, but must be a finite number of seconds > 0")
     preset = replace(preset, first=tuple(each for each in preset.first if not isinstance(each, Unless)))
     fitting, factors = preset, Seconds(1.0, 1.0, 1.0)
     least = scaled(preset, Seconds(0.0, 0.0, 0.0))
     for _ in range(3):
         took = measure(fitting)
         if fitting == least and took.first > seconds:
-            raise ValueError(f"budget is {seconds:g} s, but the least that this preset needs is {took.first:.2g} s")
+            raise InputError(f"budget is {seconds:g} s, but the least that this preset needs is {took.first:.2g} s")
         again = AGAIN * seconds
         factors = Seconds(
             factors.first * seconds / took.first,

@@ -20,6 +20,7 @@ from rich.console import Console
 
 from larp_model import state as packed
 from larp_model.bodies import human_and_ball, standing_height
+from larp_model.errors import InputError
 from larp_model.files import write_whole
 from larp_model.scene import Scene
 from larp_model.truth.mujoco import Truth
@@ -171,7 +172,7 @@ def main(
     """
     for name, value, least in (("rounds", rounds, 1), ("population", population, 4), ("kicks", kicks, 1)):
         if value < least:
-            raise ValueError(f"{name} is {value}, but must be at least {least}")
+            raise InputError(f"{name} is {value}, but must be at least {least}")
     console, scene, random = Console(), human_and_ball(), np.random.default_rng(seed)
     authored = key_poses.load()
     mean = numbers(authored)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from larp_model import state as packed
+from mpc import nearest_on_path
 
 
 def pose(states: Array, controls: Array, context: Any, human: slice = slice(None)) -> Array:
@@ -30,6 +31,12 @@ def apart(states: Array, controls: Array, context: Any, link: int, other: int) -
     """(3,) how far two links, by their rows, are apart where they come nearest to each other under control [m]."""
     found = states[: len(controls), link, packed.POSITION] - states[: len(controls), other, packed.POSITION]
     return found[jnp.argmin(jnp.sum(found**2, axis=-1))]
+
+
+def miss(states: Array, controls: Array, context: Any, ball: int) -> Array:
+    """(3,) from `goal` (3,) [m] of the context to where the path of a ball, by its row, passes it nearest [m]."""
+    nearest, _ = nearest_on_path(states[:, ball, packed.POSITION], context["goal"])
+    return nearest - context["goal"]
 
 
 def upright(states: Array, controls: Array, context: Any) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -10,7 +11,8 @@ from pathlib import Path
 from larp_model.anatomy import KINDS, Detail
 from larp_model.bodies import chain, detail_of, human_and_ball, human_and_capsule, two_balls, two_chains
 from larp_model.designs import DesignName, SizeName
-from larp_model.names import require_known
+from larp_model.errors import InputError
+from larp_model.names import require_file, require_known
 from larp_model.scene import Scene
 from larp_model.truth.episodes import Episodes
 from tasks.data import WINDOWS, random_episodes
@@ -98,7 +100,7 @@ def around(chosen: Scenario, reference: Path | None, varied: bool) -> Scenario:
         return chosen
     if not any(body.kind in KINDS.values() for body in chosen.scene.bodies):
         asked = "reference" if reference else "bodies varied"
-        raise ValueError(f"{asked} is asked for, but the scene {chosen.name} has no human")
+        raise InputError(f"{asked} is asked for, but the scene {chosen.name} has no human")
     if reference is None:
         return replace(chosen, draw=partial(_around_the_kick, chosen.scene, varied=True), paper=())
     kick = references.captured(reference, _kicking(chosen.scene))
@@ -111,6 +113,23 @@ def trained_at(name: str, design: DesignName | None = None, size: SizeName | Non
 
 
 def scenario(name: str) -> Scenario:
-    """The scenario of that name."""
-    require_known("scene", name, SCENARIOS)
-    return SCENARIOS[name]
+    """The scenario of that name, or the one that a Python file defines, FILE.py:NAME.
+
+    There NAME is a `Scenario`, or a `Scene` without motors, whose bodies are thrown; the file is executed.
+    """
+    file, _, own = name.rpartition(":")
+    if not file.endswith(".py"):
+        require_known("scene", name, SCENARIOS)
+        return SCENARIOS[name]
+    require_file("scene", file)
+    defined = runpy.run_path(file)
+    scenes = [key for key, value in defined.items() if isinstance(value, Scene | Scenario)]
+    require_known(f"scene is {name!r}: {own}", own, scenes)
+    match defined[own]:
+        case Scenario() as chosen:
+            return chosen
+        case scene if scene.motors:
+            needed = "make it a tasks.scenarios.Scenario, whose draw says what moves them"
+            raise InputError(f"scene is {name!r}, which has motors: {needed}")
+        case scene:
+            return _thrown(own.lower(), scene)

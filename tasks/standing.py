@@ -64,25 +64,27 @@ class Standing:
         pace = jnp.sqrt(jnp.maximum(place[..., 2:], 0.1) / self.scene.gravity)
         return (place + pace * velocity)[..., :2] - jnp.mean(packed.position(states)[..., self.feet, :2], axis=-2)
 
+    def balance(self, states: Array, controls: Array, context: Any) -> Array:
+        """(H, 2) the capture point from the middle between the feet [m], as far as it counts, `settled` (H,)."""
+        return context["settled"][:, None] * self.capture_point(states)
+
+    def feet_above(self, states: Array, controls: Array, context: Any) -> Array:
+        """(H, 2) how high both feet are above the ground [m], as far as it counts, `settled` (H,)."""
+        above = packed.position(states)[:, self.feet, 2] - self.lying
+        return context["settled"][:, None] * jnp.maximum(above, 0.0)
+
+    def lean(self, states: Array, controls: Array, context: Any) -> Array:
+        """(H, 4) what of the upward axes of pelvis and torso is horizontal."""
+        up = rotation.matrix(packed.orientation(states[:, self.trunk]))[..., :2, 2]
+        return up.reshape(len(states), -1)
+
     @property
     def terms(self) -> tuple[CostTerm, ...]:
         """The named costs of a candidate."""
-
-        def balance(states: Array, controls: Array, context: Any) -> Array:
-            return context["settled"][:, None] * self.capture_point(states)
-
-        def feet(states: Array, controls: Array, context: Any) -> Array:
-            above = packed.position(states)[:, self.feet, 2] - self.lying
-            return context["settled"][:, None] * jnp.maximum(above, 0.0)
-
-        def lean(states: Array, controls: Array, context: Any) -> Array:
-            up = rotation.matrix(packed.orientation(states[:, self.trunk]))[..., :2, 2]
-            return up.reshape(len(states), -1)
-
         return (
-            CostTerm("balance", balance, quadratic, 100.0),
-            CostTerm("feet", feet, quadratic, 50.0),
-            CostTerm("lean", lean, quadratic, 20.0),
+            CostTerm("balance", self.balance, quadratic, 100.0),
+            CostTerm("feet", self.feet_above, quadratic, 50.0),
+            CostTerm("lean", self.lean, quadratic, 20.0),
             CostTerm("upright", residuals.upright, quadratic, 100.0),
             CostTerm("effort", residuals.effort, quadratic, 0.2),
         )

@@ -23,11 +23,13 @@ from typing import Any, NamedTuple, Self
 
 import jax
 import numpy as np
+from jax.typing import ArrayLike
 from rich.table import Table
 
 from larp_model import state as packed
 from larp_model.anatomy import Detail
 from larp_model.bodies import human_and_ball, standing_height
+from larp_model.errors import InputError
 from larp_model.files import require_writable, write_whole
 from larp_model.scene import Scene
 from larp_model.truth.mujoco import FINE_SUBSTEPS, Truth
@@ -96,6 +98,10 @@ class Task(ABC):
         self._models: dict[tuple[str | int, Path], Models] = {}
         self._bases: dict[int, tuple[Models, Planner, Planner]] = {}  # by the model, with which they are kept
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Copies, and other processes, make their own models and planners."""
+        return self.__dict__ | {"_planners": {}, "_models": {}, "_bases": {}}
+
     @classmethod
     def standard(
         cls,
@@ -128,7 +134,7 @@ class Task(ABC):
     ) -> Self:
         """The task of a scene's human; see `standard`."""
         if names is not None and not isinstance(reference, str | Path):
-            raise ValueError(f"names is {str(names)!r}, but there is no file whose joints they could be")
+            raise InputError(f"names is {str(names)!r}, but there is no file whose joints they could be")
         if reference is None:
             return cls(scene, references.embedded(scene), substeps, shipped(scene, embedded=True))
         if isinstance(reference, Reference):
@@ -300,7 +306,7 @@ class Task(ABC):
         dynamics: DynamicsName | Dynamics = "larp",
         weights: str | Path | None = None,
         seed: int = 0,
-        state: np.ndarray | None = None,
+        state: ArrayLike | None = None,
         observe: Callable[[Execution], None] = lambda execution: None,
         world: World | None = None,
     ) -> Run:
@@ -324,7 +330,7 @@ class Task(ABC):
         planners: Planners,
         goal: Any,
         seed: int,
-        state: np.ndarray | None = None,
+        state: ArrayLike | None = None,
         steps: int | None = None,
         observe: Callable[[Execution], None] = lambda execution: None,
         sense: Callable[[np.ndarray], np.ndarray] = lambda state: state,
@@ -337,7 +343,7 @@ class Task(ABC):
         stands: whether plans go on after the task is over, to keep the human up. world: to execute in instead. window:
         what is wanted from a step on, if it is not always the goal.
         """
-        state = self.start() if state is None else state
+        state = self.start() if state is None else self.checked_state(state)
         steps = self.reference.strike + 20 + AFTER_CONTACT if steps is None else steps
         first, again, every, stand = planners
         phases = [Phase(first, again, every, window or self.window(goal), self.over(state, steps), LINGER)]
@@ -358,6 +364,19 @@ class Task(ABC):
             observe=observe,
             sense=sense,
         )
+
+    def checked_state(self, state: ArrayLike) -> np.ndarray:
+        """A state (L, 13) of this task's scene; refuses, by name, all else."""
+        needed = (len(self.scene.links), packed.SIZE)
+        try:
+            array = np.asarray(state, float)
+        except (TypeError, ValueError):
+            raise InputError(f"state is of type {type(state).__name__}, but needs numbers of shape {needed}") from None
+        if array.shape != needed:
+            raise InputError(f"state has shape {array.shape}, but needs {needed}")
+        if not np.isfinite(array).all():
+            raise InputError("state has numbers that are not finite, but needs all of them finite")
+        return array
 
     def touched(self, start: np.ndarray, steps: int) -> Callable[[int, np.ndarray], bool]:
         """Whether, in a step with a state (L, 13), the ball is no longer as from the start (L, 13) if untouched."""
@@ -504,5 +523,5 @@ class Run:
 def checked_target(target: np.ndarray | tuple[float, ...]) -> np.ndarray:
     """The target (3,) [m]; refuses what is not three finite numbers."""
     if np.shape(target) != (3,) or not np.isfinite(target).all():
-        raise ValueError(f"target is {target}, but must be three finite numbers, in metres")
+        raise InputError(f"target is {target}, but must be three finite numbers, in metres")
     return np.asarray(target, float)

@@ -6,6 +6,7 @@ its last checkpoint. So the same command takes up a run that was cut off.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import platform
@@ -24,16 +25,19 @@ from rich.console import Console
 from larp_model import designs, evaluation, training
 from larp_model import weights as stored
 from larp_model.designs import DesignName, SizeName
+from larp_model.errors import InputError
+from larp_model.files import require_writable, write_whole
 from larp_model.losses import LossWeights
+from larp_model.names import require_file
 from larp_model.networks import Weights
-from larp_model.parts.part import assemble
+from larp_model.parts.part import Model, assemble
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from larp_model.truth import episodes as truth_episodes
 from larp_model.truth.episodes import Episodes
 from larp_model.truth.mujoco import SUBSTEPS, Truth
 from mpc import CEM
-from tasks.command import remember_compilations, run
+from tasks.command import prepare_jax, run
 from tasks.curve import curve_picture
 from tasks.data import contact_episodes, random_task
 from tasks.kick import Kick
@@ -152,6 +156,38 @@ def stored_episodes(path: Path, scene: Scene, make: Callable[[], tuple[Episodes,
     return truth_episodes.load(path, scene)
 
 
+def model_of(chosen: Scenario, design: DesignName, size: SizeName | None) -> Model:
+    """The untrained model of a scene."""
+    if design == "hybrid":
+        return designs.hybrid(chosen.scene, designs.SIZES[size or "small"])
+    if size:
+        raise InputError(f"size is {size!r}, but only the hybrid design comes in sizes, not {design!r}")
+    return designs.DESIGNS[design](chosen.scene)
+
+
+def claim(folder: Path, settings: dict[str, Any]) -> None:
+    """Mark a run's folder by its settings; refuse one that was begun with others, whose stages would be kept.
+
+    settings: what JSON holds, by the names of arguments.
+    """
+    path = folder / "settings.json"
+    settings = json.loads(json.dumps(settings))
+    if path.is_file():
+        try:
+            begun = dict(json.loads(path.read_text()))
+        except ValueError:
+            raise InputError(f"folder is {str(folder)!r}, but its settings.json is damaged: take another one") from None
+        for name, value in settings.items():
+            if begun.get(name) != value:
+                raise InputError(
+                    f"{name} is {value!r}, but the run in {folder} was begun with {begun.get(name)!r}: "
+                    "take another --folder, or delete that one"
+                )
+    elif (folder / "random.npz").exists():
+        raise InputError(f"folder is {str(folder)!r}, but holds a run of unknown settings: take another one")
+    write_whole(path, (json.dumps(settings, indent=1) + "\n").encode())
+
+
 def main(
     scene: str = WEIGHTS,
     design: DesignName | None = None,
@@ -167,11 +203,11 @@ def main(
     """Train the learned simulator of a scene.
 
     Args:
-        scene: what is simulated; human_ball is the kick's.
+        scene: what is simulated; human_ball is the kick's. Or FILE.py:NAME, a Scene or a Scenario of your own.
         design: which parts it is made of; compact for the kick and hybrid for all else by default.
         size: of the hybrid's networks; small by default.
         folder: where the run keeps its stages and checkpoints; runs/train/SCENE by default, SCENE_DESIGN_SIZE where
-            they are given.
+            they are given. A run goes on only with the settings that it was begun with.
         out: where the weights and their manifest go; a folder of the run's by default.
         episodes: random truth episodes.
         tasks: kicks planned for the candidates of each stage that adds some.
@@ -180,19 +216,29 @@ def main(
         start: manifest of weights to go on from: stages that they have been through are left out.
     """
     if start and size:
-        raise ValueError(f"size is {size!r}, but the networks of weights to go on from keep their own: leave it out")
+        raise InputError(f"size is {size!r}, but the networks of weights to go on from keep their own: leave it out")
     console, chosen = Console(), scenario(scene)
     folder = folder or trained_at(chosen.name, design, size)
-    remember_compilations()
+    require_writable(folder, "folder")
+    if start:
+        require_file("from", start)
     design = design or ("compact" if chosen.name == WEIGHTS else "hybrid")
     kick = Kick.standard() if (chosen.name, design) == (WEIGHTS, "compact") else None
     stages = PAPER if design == "paper" else KICK if kick else stages_of(chosen)
-    if design == "hybrid":
-        model = designs.hybrid(chosen.scene, designs.SIZES[size or "small"])
-    elif size:
-        raise ValueError(f"size is {size!r}, but only the hybrid design comes in sizes, not {design!r}")
-    else:
-        model = designs.DESIGNS[design](chosen.scene)
+    model = model_of(chosen, design, size)
+    settings = {
+        "scene": chosen.name,
+        "design": design,
+        "size": size,
+        "episodes": episodes,
+        "tasks": tasks,
+        "effort": effort,
+        "seed": seed,
+        "from": start and hashlib.sha256(start.read_bytes()).hexdigest()[:12],
+        "recipe of the scene": hashlib.sha256(repr((model, stages)).encode()).hexdigest()[:12],
+    }
+    claim(folder, settings)
+    prepare_jax()
     random = stored_episodes(folder / "random.npz", chosen.scene, lambda: chosen.draw(episodes, seed), console)
     sources = {"random": random}
 
@@ -263,8 +309,8 @@ def main(
         "hardware": f"{platform.machine()}, {os.cpu_count()} cores, jax {jax.__version__} on {jax.default_backend()}",
         "scores": {"seed": EVALUATION_SEED, **scores},
     }
-    console.print_json(json.dumps(scores))
     written = save(out or folder / "weights", recipe_of)
+    console.print_json(json.dumps(scores))
     console.print(f"weights: {written}")
 
 

@@ -15,11 +15,11 @@ from larp_model import designs
 from larp_model.bodies import human_and_ball
 from larp_model.networks import Weights
 from larp_model.parts.part import Model
+from larp_model.runtime import remember_compilations
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from larp_model.training import Recipe, Windows, statistics_of
 from larp_model.truth.episodes import Episodes
-from tasks.command import remember_compilations
 from tasks.data import random_episodes
 from tasks.motions.references import Reference, embedded
 

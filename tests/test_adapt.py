@@ -11,6 +11,7 @@ import pytest
 from larp_model import designs, training
 from larp_model import weights as stored
 from larp_model.bodies import human_and_ball
+from larp_model.errors import InputError
 from tasks import adapt
 from tasks.adapt import Checked
 from tasks.data import random_episodes
@@ -53,7 +54,7 @@ def test_smaller_errors_are_better_and_the_same_are_not() -> None:
 def test_bad_input_is_refused_before_anything_is_drawn(
     given: dict[str, object], complaint: str, manifest: Path, tmp_path: Path
 ) -> None:
-    with pytest.raises(ValueError, match=complaint):
+    with pytest.raises(InputError, match=complaint):
         adapt.main(**({"weights": manifest, "out": tmp_path / "out"} | given))  # type: ignore[arg-type]
     assert not list((tmp_path / "out").glob("*.json"))
 

@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from larp_model.errors import InputError
 from tasks.benchmarks import pose as benchmark
 from tasks.keypoints import aist, arrays, lift, metrics
 from tasks.keypoints import figure as figures
@@ -154,7 +155,7 @@ class Trap:
 
 def refused(path: Path, content: bytes, said: str) -> None:
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=said) as error:
+    with pytest.raises(InputError, match=said) as error:
         arrays.load(path)
     assert "\n" not in str(error.value) and str(error.value).startswith(path.name)
 
@@ -224,7 +225,7 @@ def test_no_damage_to_a_pickle_fails_but_with_a_refusal_in_one_line(
     path.write_bytes(content)
     try:
         arrays.load(path)
-    except ValueError as error:
+    except InputError as error:
         assert "\n" not in str(error) and str(error).startswith("damaged.pkl")
 
 
@@ -313,7 +314,7 @@ def test_what_is_missing_or_damaged_is_refused_in_one_line(name: str, kick: np.n
     folder = annotated(tmp_path / "aist", kick).folder
     damage, said = WRONG[name]
     damage(folder)
-    with pytest.raises(ValueError, match=said) as error:
+    with pytest.raises(InputError, match=said) as error:
         aist.load(folder, SEQUENCE, VIEW)
     assert "\n" not in str(error.value)
 
@@ -339,7 +340,7 @@ def test_a_benchmark_of_dances_that_makes_no_sense_is_refused(
     annotated(tmp_path / "empty", kick)
     for path in (tmp_path / "empty" / "keypoints2d").iterdir():
         path.unlink()
-    with pytest.raises(ValueError, match=said) as error:
+    with pytest.raises(InputError, match=said) as error:
         benchmark.main(**{"aist": folder, "json": tmp_path / "pose.json"} | arguments)
     assert "\n" not in str(error.value)
 

@@ -13,7 +13,9 @@ ROOT = Path(__file__).parents[1]
 # A module imports only from modules listed before it, so a new file goes below all that it imports.
 # A package's own name is its __init__.py, which re-exports what stands above.
 ORDER = [
+    "larp_model.errors",
     "larp_model.files",
+    "larp_model.runtime",
     "larp_model.names",
     "larp_model.scene",
     "larp_model.anatomy",

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from rich.table import Table
 
+from larp_model.errors import InputError
 from mpc import CEM
 from tasks.benchmarks import kick, report
 from tasks.presets import PRESETS, Preset
@@ -59,13 +60,13 @@ def test_rows_of_another_kind_are_not_taken_over(change: str, tmp_path: Path, mo
 
 def test_a_json_that_could_not_be_written_is_refused_before_anything_else(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(ValueError, match="json needs the folder"):
+    with pytest.raises(InputError, match="json needs the folder"):
         kick.main(json=tmp_path / "file" / "kick.json", weights=Path("nowhere.json"))
 
 
 def test_results_are_published_only_where_the_project_lies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match="publish"):
+    with pytest.raises(InputError, match="publish"):
         kick.main(publish=True, weights=Path("nowhere.json"))
 
 
@@ -98,5 +99,5 @@ def test_the_kick_benchmark_keeps_its_rows_and_touches_no_results(
 
 def test_many_bodies_have_neither_one_height_nor_one_budget(tmp_path: Path) -> None:
     for asked in ({"height": 1.6}, {"budget": 1.0}):
-        with pytest.raises(ValueError, match="bodies is 'varied', but height and budget are those of one body"):
+        with pytest.raises(InputError, match="bodies is 'varied', but height and budget are those of one body"):
             kick.main(json=tmp_path / "kick.json", bodies="varied", **asked)  # type: ignore[arg-type]

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
 from larp_model.bodies import ball, capsule, chain, human
+from larp_model.errors import InputError
 from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface
 from larp_model.truth.bullet import BulletTruth, give, inertia
 from larp_model.truth.mujoco import Truth, compile_model
@@ -70,7 +71,7 @@ def open_worlds() -> int:
 
 def test_without_the_engine_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pybullet", None)
-    with pytest.raises(ValueError) as caught:
+    with pytest.raises(InputError) as caught:
         BulletTruth(Scene((ball(),)))
     assert str(caught.value) == MISSING
 
@@ -245,20 +246,20 @@ def test_contacts_that_a_scene_leaves_out_do_not_happen(bullet: type[BulletTruth
 
 def test_what_bullet_cannot_do_is_refused(bullet: type[BulletTruth]) -> None:
     pair = Pair("capsule", "ball", ("capsule",), ("ball",), human().surface)
-    with pytest.raises(ValueError, match=r"scene\.pairs gives 'capsule' and 'ball' the surface"):
+    with pytest.raises(InputError, match=r"scene\.pairs gives 'capsule' and 'ball' the surface"):
         bullet(Scene((capsule(), ball()), (pair,)))
     heavy, middle, light = (ball(name, mass=mass) for name, mass in (("heavy", 3.0), ("middle", 2.0), ("light", 1.0)))
     pairs = (
         Pair("heavy", "middle", ("ball",), ("ball",), ball().surface),
         Pair("middle", "light", ("ball",), ("ball",), ball().surface),
     )
-    with pytest.raises(ValueError, match="'middle' and 'light'"):
+    with pytest.raises(InputError, match="'middle' and 'light'"):
         bullet(Scene((heavy, middle, light), pairs))
 
 
 @pytest.mark.parametrize("name", ["batch", "substeps"])
 def test_counts_must_be_positive(name: str) -> None:
-    with pytest.raises(ValueError, match=f"{name} is 0"):
+    with pytest.raises(InputError, match=f"{name} is 0"):
         BulletTruth(Scene((ball(),)), **{name: 0})
 
 
@@ -273,5 +274,5 @@ def test_chains_of_every_size_are_thrown_as_in_the_truth(bullet: type[BulletTrut
 
 
 def test_sizes_of_another_batch_are_refused_by_shape(bullet: type[BulletTruth]) -> None:
-    with pytest.raises(ValueError, match=r"morphology has shape \(1, 1, 3\), but needs \(2, 1, 3\)"):
+    with pytest.raises(InputError, match=r"morphology has shape \(1, 1, 3\), but needs \(2, 1, 3\)"):
         bullet(Scene((ball(),)), 2).resize(np.ones((1, 1, 3)))

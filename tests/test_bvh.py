@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from larp_model.bodies import human
+from larp_model.errors import InputError
 from larp_model.scene import Scene
 from tasks.benchmarks import reference as benchmark
 from tasks.motions import angles, bvh, skeleton
@@ -158,7 +159,7 @@ GOOD = text({}, STANDING, STANDING)
     ],
 )
 def test_refused_in_one_line(load: Callable[[str], skeleton.Motion], content: str, expected: str) -> None:
-    with pytest.raises(ValueError, match=expected) as refusal:
+    with pytest.raises(InputError, match=expected) as refusal:
         load(content)
     assert str(refusal.value).startswith("clip.bvh ") and "\n" not in str(refusal.value)
 
@@ -180,7 +181,7 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
 
 
 def test_missing_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"path is .*none\.bvh.* no such file"):
+    with pytest.raises(InputError, match=r"path is .*none\.bvh.* no such file"):
         bvh.load(tmp_path / "none.bvh")
 
 
@@ -193,7 +194,7 @@ def load_or_refuse(path: Path, content: bytes) -> None:
     path.write_bytes(content)
     try:
         motion = bvh.load(path)
-    except ValueError:
+    except InputError:
         return
     assert np.isfinite(motion.positions).all() and np.isfinite(motion.orientations).all()
 
@@ -283,26 +284,26 @@ def test_strike_is_where_the_toe_is_fastest(load: Callable[[str], skeleton.Motio
 
 
 def test_speeds_need_frames(load: Callable[[str], skeleton.Motion]) -> None:
-    with pytest.raises(ValueError, match="frames"):
+    with pytest.raises(InputError, match="frames"):
         skeleton.toe_speed(load(GOOD))
 
 
 def test_a_motion_without_a_kick_is_no_reference(tmp_path: Path, scene: Scene) -> None:
     path = tmp_path / "standing.bvh"
     path.write_text(text({}, *[STANDING] * 20))
-    with pytest.raises(ValueError, match="is no kick"):
+    with pytest.raises(InputError, match="is no kick"):
         captured(path, scene)
-    with pytest.raises(ValueError, match="seconds_before"):
+    with pytest.raises(InputError, match="seconds_before"):
         captured(path, scene, seconds_before=0.0)
 
 
 def test_benchmark_compares_clips_with_the_embedded_kick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)  # where RESULTS.md and runs/ are written
-    with pytest.raises(ValueError, match="clips is"):
+    with pytest.raises(InputError, match="clips is"):
         benchmark.main(clips=tmp_path)
     assert not list(tmp_path.iterdir())
     (tmp_path / "swing.bvh").write_text(text(*swing(121, "Left")))
-    with pytest.raises(ValueError, match="publish is set"):
+    with pytest.raises(InputError, match="publish is set"):
         benchmark.main(clips=tmp_path, publish=True)
     Path("RESULTS.md").write_text("# Results\n")
     benchmark.main(clips=tmp_path)

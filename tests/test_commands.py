@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import errno
+import io
+import os
 import subprocess
 import sys
+from collections.abc import Callable
 from importlib.metadata import entry_points, version
 from pathlib import Path
+from typing import TextIO
 
+import numpy as np
 import pytest
 
 import larp_model
 from larp_model import Simulator, commands, human
+from larp_model.errors import InputError
+from larp_model.files import write_whole, written_whole
 from larp_model.names import require_file
+from mpc.loop import Diverged
+from tasks.command import Stream, Teller, run
 from tasks.presets import preset_of
 from tasks.scenarios import scenario
 
@@ -43,5 +53,104 @@ def test_a_mistyped_name_is_answered_with_the_nearest(tmp_path: Path) -> None:
         (lambda: human(lengths={"thig": 1.1}), "thigh"),
         (lambda: require_file("reference", tmp_path / "kik.bvh"), "kick.bvh"),
     ):
-        with pytest.raises(ValueError, match=f"did you mean '{meant}'"):
+        with pytest.raises(InputError, match=f"did you mean '{meant}'"):
             mistyped()  # type: ignore[no-untyped-call]
+
+
+def raising(error: BaseException) -> Callable[[], None]:
+    """A task that ends so."""
+
+    def task() -> None:
+        raise error
+
+    return task
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (InputError("target is 1"), 2, "error: target is 1"),
+        (Diverged("the world diverged in step 3"), 1, "error: the world diverged in step 3"),
+        (KeyboardInterrupt(), 130, "error: interrupted"),
+        (OSError(errno.ENOSPC, "No space left on device", "a.npz"), 1, "error: a.npz cannot be written: No space left"),
+    ],
+)
+def test_an_end_that_is_no_defect_is_told_in_one_line(
+    error: BaseException, code: int, line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        run(raising(error), [])
+    told = capsys.readouterr().err
+    assert ended.value.code == code and told.startswith(line) and told.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "error", [ValueError("operands"), TypeError("x"), FileNotFoundError(errno.ENOENT, "No such file"), OSError("y")]
+)
+def test_a_defect_keeps_its_traceback(error: Exception) -> None:
+    with pytest.raises(type(error)) as raised:
+        run(raising(error), [])
+    assert raised.value is error
+
+
+def test_a_reader_that_leaves_does_not_end_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading, writing = os.pipe()
+    done = []
+
+    def task() -> None:
+        tell = Teller()
+        tell("first")
+        os.close(reading)
+        for _ in range(3):
+            tell("nobody hears this")
+        done.append(True)
+
+    with os.fdopen(writing, "w") as stdout:
+        monkeypatch.setattr(sys, "stdout", stdout)
+        run(task, [])
+        assert done == [True]
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a device that is always full")
+def test_a_full_stdout_is_told_when_all_is_done(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    done = []
+
+    def task() -> None:
+        Teller()("a line")
+        print("another")
+        done.append(True)
+
+    with open("/dev/full", "w") as stdout:
+        monkeypatch.setattr(sys, "stdout", stdout)
+        with pytest.raises(SystemExit) as ended:
+            run(task, [])
+    assert done == [True] and ended.value.code == 1
+    assert capsys.readouterr().err == "error: stdout cannot be written: No space left on device\n"
+
+
+def test_a_terminal_is_told_in_the_signs_that_it_has() -> None:
+    raw = io.BytesIO()
+    terminal: TextIO = io.TextIOWrapper(raw, encoding="ascii")
+    stream = Stream(terminal)
+    print("turned by 3° …", file=stream)
+    stream.flush()
+    assert raw.getvalue() == b"turned by 3? ?\n" and stream.failure is None
+
+
+def test_what_cannot_be_written_is_named_and_what_was_there_stays(tmp_path: Path) -> None:
+    resource = pytest.importorskip("resource")
+    path = tmp_path / "kick.npz"
+    write_whole(path, b"before")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))  # as on a full disk
+    try:
+        with pytest.raises(OSError) as full:
+            write_whole(path, bytes(100_000))
+        with pytest.raises(OSError), written_whole(path) as file:
+            np.save(file, np.zeros(100_000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert full.value.filename == str(path) and full.value.errno == errno.EFBIG
+    assert [each.name for each in tmp_path.iterdir()] == ["kick.npz"] and path.read_bytes() == b"before"

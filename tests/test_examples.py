@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from tasks.command import remember_compilations
+from larp_model.runtime import remember_compilations
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -22,15 +25,29 @@ def test_a_task_from_outside_meets_its_goals(tmp_path: Path, monkeypatch: pytest
 
 @pytest.mark.parametrize(
     ("name", "given"),
-    [("own_cost", ()), ("own_reference", ()), ("own_world", ()), ("own_model", ()), ("own_human", ()), ("batch", (2,))],
+    [
+        ("own_cost", ()),
+        ("own_reference", ()),
+        ("own_world", ()),
+        ("own_model", ()),
+        ("own_human", ()),
+        ("own_scene", (1e-4, 40)),
+    ],
 )
 def test_what_an_example_says_of_itself_holds(
-    name: str, given: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, given: tuple[float, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     remember_compilations()  # they plan with the same planners
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(EXAMPLES)
     runpy.run_path(str(EXAMPLES / f"{name}.py"))["main"](*given)
+
+
+def test_kicks_are_shared_among_processes(tmp_path: Path) -> None:
+    path = tmp_path / "kicks.npz"
+    subprocess.run([sys.executable, EXAMPLES / "batch.py", "2", path, "2"], check=True, capture_output=True)
+    with np.load(path, allow_pickle=False) as kicks:
+        assert kicks["states"].shape[0] == len(np.unique(kicks["targets"], axis=0)) == 2
 
 
 def test_the_notebook_runs_and_shows_its_replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -46,7 +63,7 @@ def test_the_notebook_runs_and_shows_its_replay(tmp_path: Path, monkeypatch: pyt
 
 
 def test_every_example_is_run() -> None:
-    run = {"pass_to_runner", "own_cost", "own_reference", "own_world", "own_model", "own_human", "batch"}
+    run = {"pass_to_runner", "own_cost", "own_reference", "own_world", "own_model", "own_human", "own_scene", "batch"}
     assert {path.stem for path in EXAMPLES.glob("*.py")} == run
 
 

@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from larp_model.errors import InputError
 from tasks.keypoints import formats
 from tasks.keypoints.points import POINTS, Keypoints
 
@@ -568,7 +569,7 @@ def test_a_file_that_is_damaged_or_of_another_kind_is_refused(tmp_path: Path, co
 
 
 def refused(path: Path, said: str, **arguments: Any) -> None:
-    with pytest.raises(ValueError, match=said) as error:
+    with pytest.raises(InputError, match=said) as error:
         formats.load(path, **arguments)
     assert "\n" not in str(error.value)
 
@@ -716,7 +717,7 @@ def test_nothing_else_in_a_file_fails_but_with_a_refusal_in_one_line(name: str, 
         dump(damaged, replaced(json.loads(damaged.read_bytes()), data.draw))
         try:
             assert 0 < len(formats.load(written, RATE, SIZE).keypoints) <= formats._MOST_FRAMES
-        except ValueError as error:
+        except InputError as error:
             assert str(error).startswith(f"{written.name} has") or "understood are" in str(error)
             assert "\n" not in str(error)
 
@@ -732,5 +733,5 @@ def test_no_damage_to_an_npz_file_fails_but_with_a_refusal_in_one_line(place: in
         (path / "clip.npz").write_bytes(content[:place] if cut else content)
         try:
             assert len(formats.load(path / "clip.npz", RATE).keypoints) == 3
-        except ValueError as error:
+        except InputError as error:
             assert "\n" not in str(error)

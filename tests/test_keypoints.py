@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from larp_model.bodies import human_and_ball
+from larp_model.errors import InputError
 from larp_model.scene import Scene
 from larp_model.truth.mujoco import closed
 from tasks.keypoints import camera as cameras
@@ -92,7 +93,7 @@ class TestCamera:
     def test_what_it_cannot_be_is_refused_by_name(self, given: str, said: str, tmp_path: Path) -> None:
         path = tmp_path / "camera.json"
         path.write_text(given)
-        with pytest.raises(ValueError, match=r"camera|field_of_view|look_at") as refused:
+        with pytest.raises(InputError, match=r"camera|field_of_view|look_at") as refused:
             cameras.load(path)
         assert said in str(refused.value) and "\n" not in str(refused.value)
 

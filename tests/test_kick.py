@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import json
+import socket
 from pathlib import Path
+from pickle import dumps
+from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -12,9 +17,10 @@ from scipy.spatial.transform import Rotation
 from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.bodies import human_and_ball, standing_height
+from larp_model.errors import InputError
 from mpc import CEM
 from tasks import kick
-from tasks.command import run
+from tasks.command import Teller, run
 from tasks.data import random_task
 from tasks.models import WEIGHTS, models_of, shipped
 from tasks.motions import references
@@ -140,9 +146,17 @@ def test_the_limit_is_the_miss_of_the_same_controls_at_the_finer_step(small: Non
 
 
 def test_a_kick_end_to_end_leaves_all_its_files_and_they_agree(
-    tmp_path: Path, small: None, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, small: None, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    tell, saved = Teller.result, list[set[str]]()
+
+    def result(self: Teller, *arguments: Any) -> None:
+        saved.append({path.name for path in tmp_path.iterdir()})
+        tell(self, *arguments)
+
+    monkeypatch.setattr(Teller, "result", result)
     kick.main((3.0, 0.3, 0.4), preset="fast", out=tmp_path, seed=3, json=True)
+    assert saved == [{path.name for path in tmp_path.iterdir()}], "what is told may be lost, and is told last"
     assert {path.name for path in tmp_path.iterdir()} == {"summary.json", "kick.npz", "kick.png", "kick.html"}
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert set(summary) >= PROTOCOL
@@ -163,6 +177,41 @@ def test_later_kicks_of_a_preset_compile_nothing_again(small: None) -> None:
     assert first.states.shape[1:] == (14, 13) and first.joint_targets.shape[1:] == (12, 3)
     assert again.truth_error_m == again.summary["truth_error_m"] and again.recording.target[1] == -0.2
     assert "Kick to (3.00, -0.20, 0.40) m" in str(again.table.title)
+    for used in (task, first, task.planners("fast", "mujoco")[0].first):
+        assert dumps(used) and copy.deepcopy(used) is not used, "processes of a pool may take and return it"
+    assert copy.deepcopy(first).truth_error_m == first.truth_error_m
+
+
+def test_a_copied_planner_plans_the_same(task: kick.Kick, small: None) -> None:
+    coarse = kick.Kick.standard(substeps=4)
+    planner, window = coarse.planners("fast", "mujoco")[0].first, coarse.window((3.0, 0.2, 0.4))(0)
+    plans = [
+        each.step(each.init(jax.random.key(0)), coarse.start(), window.controls, window.context, steps=window.steps)[0]
+        for each in (planner, copy.deepcopy(planner))
+    ]
+    np.testing.assert_array_equal(plans[0].knots, plans[1].knots)
+
+
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [
+        (np.zeros((3, 13)), r"state has shape \(3, 13\), but needs \(14, 13\)"),
+        ([[1.0], [1.0, 2.0]], "state is of type list, but needs numbers"),
+        (np.full((14, 13), np.nan), "state has numbers that are not finite"),
+        ("standing", "state is of type str"),
+    ],
+)
+def test_a_state_of_another_scene_is_refused_by_name(task: kick.Kick, state: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        task.checked_state(state)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(task.checked_state(task.start().tolist()), task.start())
+
+
+def test_a_ball_that_is_moved_by_no_vector_is_refused_by_name(task: kick.Kick) -> None:
+    with pytest.raises(InputError, match="ball_offset is"):
+        task.start((0.1, 0.0, 0.0))  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="ball_velocity is"):
+        task.start(ball_velocity=(np.inf, 0.0))
 
 
 def test_a_target_out_of_reach_is_marked_and_still_gets_a_plan(task: kick.Kick, small: None) -> None:
@@ -176,8 +225,19 @@ def test_a_target_out_of_reach_is_marked_and_still_gets_a_plan(task: kick.Kick, 
 
 def test_an_output_folder_that_cannot_be_written_is_refused_before_anything_else(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(ValueError, match="out needs the folder"):
+    with pytest.raises(InputError, match="out needs the folder"):
         kick.main(out=tmp_path / "file" / "kick", weights=Path("nowhere.json"))
+
+
+def test_a_port_that_is_taken_is_refused_before_anything_is_set_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kick.Kick, "standard", lambda *arguments: pytest.fail("it was set up"))
+    taken, refused = socket.create_server(("127.0.0.1", 0)), r"port \d+ of host '127\.0\.0\.1' cannot be opened"
+    with taken, pytest.raises(InputError, match=refused):
+        kick.main(out=tmp_path / "out", view=True, port=taken.getsockname()[1])
+    with pytest.raises(InputError, match=r"allow_host has 'https://hub\.example'"):
+        kick.main(out=tmp_path / "out", view=True, port=0, allow_host=("https://hub.example",))
 
 
 @pytest.mark.parametrize(

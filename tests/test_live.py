@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from larp_model import state as packed
 from larp_model.bodies import human_and_ball
+from larp_model.errors import InputError
 from tasks.kick import Kick, wished
 from tasks.live import ROLLS, SPOTS, TARGETS, Choices, Pushed, opened, weights_for
 from tasks.presets import PRESETS
@@ -115,7 +116,7 @@ def test_a_kept_kick_of_another_scene_or_damaged_is_refused(kick: Kick, tmp_path
     (tmp_path / "summary.json").write_text(json.dumps(summary))
     for damage in (lambda path: None, lambda path: path.write_bytes(b"PK"), other_scene):
         damage(tmp_path / "kick.npz")
-        with pytest.raises(ValueError, match=r"cannot be read|has shape"):
+        with pytest.raises(InputError, match=r"cannot be read|has shape"):
             opened(kick, tmp_path)
 
 

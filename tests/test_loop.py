@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from larp_model.errors import InputError
 from mpc import CEM, CostTerm, GaussNewton, Plan, Planner, Verified
 from mpc.loop import Begun, Phase, Window, execute
 
@@ -186,7 +187,7 @@ def test_where_no_trial_is_finite_the_last_plan_stays() -> None:
 
 
 def test_what_is_verified_comes_last() -> None:
-    with pytest.raises(ValueError, match="optimizers: got Verified before another"):
+    with pytest.raises(InputError, match="optimizers: got Verified before another"):
         _planner(Mover(), (Verified(Mover(50.0), SEARCH), SEARCH))
 
 
@@ -231,12 +232,12 @@ def test_where_the_model_makes_steps_too_long_they_are_halved_until_they_help() 
 
 @pytest.mark.parametrize(("name", "value"), [("rounds", 0), ("candidates", 0)])
 def test_too_few_trials_are_refused_by_name(name: str, value: int) -> None:
-    with pytest.raises(ValueError, match=name):
+    with pytest.raises(InputError, match=name):
         Verified(Mover(), SEARCH, **{name: value})  # type: ignore[arg-type]
 
 
 def test_a_length_that_is_never_reached_is_refused_by_name() -> None:
-    with pytest.raises(ValueError, match="enough"):
+    with pytest.raises(InputError, match="enough"):
         Verified(Mover(), SEARCH, enough=(("miss", np.nan),))
 
 

@@ -13,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from larp_model.bodies import ball, human, kicking, standing_height
+from larp_model.errors import InputError
 from larp_model.kinematics import displacement
 from larp_model.mjcf import humanoid, usual_name
 from larp_model.scene import Body, Link, anchor
@@ -115,7 +116,7 @@ def test_mujocos_own_humanoid_keeps_mass_bones_and_volume_and_stands() -> None:
 )
 def test_what_is_no_human_of_ours_is_refused_by_name(change: tuple[str, str], complaint: str, tmp_path: Path) -> None:
     (tmp_path / "other.xml").write_text(mjcf(human(), change=change))
-    with pytest.raises(ValueError, match=complaint) as caught:
+    with pytest.raises(InputError, match=complaint) as caught:
         humanoid(tmp_path / "other.xml")
     assert "\n" not in str(caught.value)
 
@@ -123,7 +124,7 @@ def test_what_is_no_human_of_ours_is_refused_by_name(change: tuple[str, str], co
 def test_bodies_of_any_name_can_be_said_to_be_our_links(tmp_path: Path) -> None:
     (tmp_path / "other.xml").write_text(mjcf(human(), change=('name="head"', 'name="skull"')))
     assert humanoid(tmp_path / "other.xml", {"head": "skull"}).sizes == pytest.approx(human().sizes)
-    with pytest.raises(ValueError, match=r"names is 'haed', .* did you mean 'head'\?"):
+    with pytest.raises(InputError, match=r"names is 'haed', .* did you mean 'head'\?"):
         humanoid(tmp_path / "other.xml", {"haed": "skull"})
 
 

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from larp_model.errors import InputError
 from mpc import (
     CEM,
     MPPI,
@@ -229,13 +230,13 @@ def test_unless_leaves_a_hollow_and_asks_for_one_candidate_where_nothing_is_amis
 def test_unless_refuses_what_it_cannot_judge_by() -> None:
     steps, problem = GaussNewton(), Hollows()
     unless = Unless((("speed", 0.1),), (steps,))
-    with pytest.raises(ValueError, match="enough: got 'speed', needs names of cost terms: miss"):
+    with pytest.raises(InputError, match="enough: got 'speed', needs names of cost terms: miss"):
         unless.improve(_at(0.0, 1), np.random.default_rng(0), problem)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="enough: got nan for 'miss', needs a finite number >= 0"):
+    with pytest.raises(InputError, match="enough: got nan for 'miss', needs a finite number >= 0"):
         Unless((("miss", np.nan),), (steps,))
-    with pytest.raises(ValueError, match="needs some of both"):
+    with pytest.raises(InputError, match="needs some of both"):
         Unless((), (steps,))
-    with pytest.raises(ValueError, match="optimizers: got Verified, which must come last of all"):
+    with pytest.raises(InputError, match="optimizers: got Verified, which must come last of all"):
         Unless((("miss", 0.1),), (Verified(PointMass(), steps),))
 
 
@@ -262,7 +263,7 @@ def test_wrong_arguments_are_refused_by_name() -> None:
         {"weights": {"miss": np.nan}},
     ]
     for wrong in wrong_steps:
-        with pytest.raises(ValueError, match=next(iter(wrong)).removesuffix("s")):
+        with pytest.raises(InputError, match=next(iter(wrong)).removesuffix("s")):
             planner.step(**{**step, **wrong})
     wrong_planners: list[dict[str, Any]] = [
         {"spread": [0.1, 0.1, 0.1]},
@@ -276,11 +277,11 @@ def test_wrong_arguments_are_refused_by_name() -> None:
         {"reheat": -1.0},
     ]
     for wrong in wrong_planners:
-        with pytest.raises(ValueError, match=next(iter(wrong))):
+        with pytest.raises(InputError, match=next(iter(wrong))):
             _planner(**wrong)
     for name, value in {"horizon": 1, "knots": 13, "dt": 0.0, "terms": TERMS[:1] * 2}.items():
         arguments: dict[str, Any] = {"terms": TERMS, "horizon": HORIZON, "knots": KNOTS, "dt": DT}
-        with pytest.raises(ValueError, match=name):
+        with pytest.raises(InputError, match=name):
             Planner(PointMass(), spread=np.ones((1, 3)), optimizers=CEM(), **{**arguments, name: value})
     optimizers: tuple[tuple[Any, str, Any], ...] = (
         (CEM, "samples", 47),
@@ -297,13 +298,13 @@ def test_wrong_arguments_are_refused_by_name() -> None:
         (GaussNewton, "jacobian", "reverse"),
     )
     for optimizer, name, number in optimizers:
-        with pytest.raises(ValueError, match=name):
+        with pytest.raises(InputError, match=name):
             optimizer(**{name: number})
-    with pytest.raises(ValueError, match="weight"):
+    with pytest.raises(InputError, match="weight"):
         CostTerm("miss", _miss, weight=-1.0)
-    with pytest.raises(ValueError, match="width"):
+    with pytest.raises(InputError, match="width"):
         l2(0.0)
-    with pytest.raises(ValueError, match="steps"):
+    with pytest.raises(InputError, match="steps"):
         Continued(PointMass(), PointMass(), slice(0, 1), 0)
 
 
@@ -347,7 +348,7 @@ def test_the_prediction_goes_on_from_the_last_step_that_suffices() -> None:
 @pytest.mark.parametrize("steps", [0, HORIZON + 1])
 def test_steps_that_are_not_in_the_horizon_are_refused(steps: int) -> None:
     planner = _planner(MujocoDynamics(Engine()))
-    with pytest.raises(ValueError, match="steps"):
+    with pytest.raises(InputError, match="steps"):
         planner.step(planner.init(jax.random.key(0)), STATE, REFERENCE, TARGET, steps=steps)
 
 
@@ -431,7 +432,7 @@ def test_what_is_not_finite_costs_infinity(value: float) -> None:
 
 def test_residual_of_the_wrong_shape_is_named() -> None:
     flat = CostTerm("flat", lambda states, controls, context: states.sum())
-    with pytest.raises(ValueError, match="'flat'"):
+    with pytest.raises(InputError, match="'flat'"):
         evaluate((flat,), jnp.zeros((HORIZON, 1, 13)), jnp.zeros((HORIZON, 1, 3)))
 
 

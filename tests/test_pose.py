@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from larp_model.bodies import human_and_ball
+from larp_model.errors import InputError
 from larp_model.truth.mujoco import Truth
 from mpc import MujocoDynamics, Verified
 from mpc.gauss_newton import FACTORS
@@ -218,10 +219,10 @@ def test_a_slow_model_is_given_as_many_candidates_as_it_has_time_for(share: floa
     ],
 )
 def test_a_benchmark_that_makes_no_sense_is_refused(arguments: dict[str, Any], said: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(InputError, match=said):
         benchmark.main(json=tmp_path / "pose.json", **arguments)
 
 
 def test_too_few_frames_are_refused(film: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match="6 or more points in 5 frames, but need 10"):
+    with pytest.raises(InputError, match="6 or more points in 5 frames, but need 10"):
         pose.cut(film["keypoints"].cut(0, 4))

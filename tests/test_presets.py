@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import get_args
 
+import numpy as np
 import pytest
 
+from larp_model.errors import InputError
 from mpc import CEM, GaussNewton, Optimizer
+from mpc.search import Problem, Search
 from tasks.presets import PRESETS, Preset, PresetName, Seconds, changed, preset_of, scaled, within
 
 
@@ -42,7 +46,7 @@ def test_a_preset_within_a_time_takes_that_time(seconds: float) -> None:
 
 @pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_budget_that_is_no_time_is_refused(seconds: float) -> None:
-    with pytest.raises(ValueError, match="budget"):
+    with pytest.raises(InputError, match="budget"):
         within(PRESETS["fast"], seconds, lambda preset: Seconds(1.0, 1.0, 1.0))
 
 
@@ -50,12 +54,12 @@ def test_a_budget_below_what_the_preset_can_do_says_what_the_least_is() -> None:
     def measure(preset: Preset) -> Seconds:
         return Seconds(*(0.01 + 2e-3 * candidates(each) for each in (preset.first, preset.again, preset.stand)))
 
-    with pytest.raises(ValueError, match=r"budget is 0\.02 s, but the least .* 0\.026 s"):
+    with pytest.raises(InputError, match=r"budget is 0\.02 s, but the least .* 0\.026 s"):
         within(PRESETS["balanced"], 0.02, measure)
 
 
 def test_an_unknown_preset_lists_the_known_ones() -> None:
-    with pytest.raises(ValueError, match="fast, balanced, accurate"):
+    with pytest.raises(InputError, match="fast, balanced, accurate"):
         preset_of("quick")
 
 
@@ -79,5 +83,39 @@ def test_any_field_of_a_preset_can_be_changed_by_its_name() -> None:
     ],
 )
 def test_a_change_that_makes_no_sense_is_refused_by_name(change: str, complaint: str) -> None:
-    with pytest.raises(ValueError, match=complaint):
+    with pytest.raises(InputError, match=complaint):
         changed(PRESETS["fast"], [change])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("every=0", "every is 0, but must be an integer of at least 1"),
+        ("every=-3", "every is -3"),
+        ("candidates=0", "candidates is 0"),
+        ("verify=(2,)", r"verify is \(2,\), but must be two integers of at least 0"),
+        ("verify=('a', 1)", "verify is "),
+        ("verify=(1, -1)", "verify is "),
+        ("enough=-1.0", "enough is -1.0"),
+        ("enough=1e999", "enough is inf"),
+        ("again.0.rounds=0", "rounds: got 0, needs at least 1"),
+        ("first=()", r"first is \(\), but must be a tuple of at least one optimiser"),
+        ("first=(1,)", "first holds 1, which is no optimiser"),
+    ],
+)
+def test_a_change_to_what_no_plan_can_be_made_with_is_refused_by_name(change: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        changed(PRESETS["fast"], [change])
+
+
+def test_an_optimiser_that_cannot_be_compared_is_refused_by_name() -> None:
+    @dataclass
+    class Mine:
+        elites = 1
+        differentiates = False
+
+        def improve(self, search: Search, random: np.random.Generator, problem: Problem) -> Search:
+            return search
+
+    with pytest.raises(InputError, match="first holds a Mine that cannot be hashed: make it a frozen dataclass"):
+        replace(PRESETS["fast"], first=(Mine(),))

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from larp_model.errors import InputError
 from larp_model.scene import Scene
 from tasks import refine
 from tasks.motions import key_poses
@@ -51,6 +52,6 @@ def test_only_the_first_kick_is_undisturbed(scene: Scene) -> None:
 
 @pytest.mark.parametrize(("name", "value"), [("rounds", 0), ("population", 3), ("kicks", 0)])
 def test_refinement_refuses_by_name(name: str, value: int, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=f"{name} is {value}"):
+    with pytest.raises(InputError, match=f"{name} is {value}"):
         refine.main(tmp_path / "poses.json", **{name: value})
     assert not list(tmp_path.iterdir())

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import Array
 
-from larp_model import designs, kinematics
+from larp_model import designs, kinematics, training
 from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.designs import DesignName
+from larp_model.errors import InputError
 from larp_model.meeting import first_contacts
 from larp_model.parts.articulated import Articulated
 from larp_model.parts.paper import PaperBody
-from larp_model.parts.part import BodyPart
+from larp_model.parts.part import BodyPart, initial_weights, measure
+from larp_model.training import Windows
 from larp_model.truth.episodes import Episodes
 from tasks import train
 from tasks.benchmarks import model
@@ -84,12 +90,12 @@ def test_chains_are_turned_at_first_and_then_left_alone() -> None:
 
 
 def test_an_unknown_scene_is_refused_by_name() -> None:
-    with pytest.raises(ValueError, match=r"scene is 'robot', but must be one of human_ball, .*chains2"):
+    with pytest.raises(InputError, match=r"scene is 'robot', but must be one of human_ball, .*chains2"):
         scenario("robot")
 
 
 def test_weights_that_are_not_shipped_are_refused_with_the_way_to_them(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"python -m tasks.train --scene two_balls"):
+    with pytest.raises(InputError, match=r"python -m tasks.train --scene two_balls"):
         model.main(scene="two_balls", json=tmp_path / "model.json")
 
 
@@ -97,7 +103,7 @@ def test_a_design_that_was_not_trained_is_refused_with_the_way_to_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match=r"beside is paper, .*python -m tasks.train --scene chain4 --design paper"):
+    with pytest.raises(InputError, match=r"beside is paper, .*python -m tasks.train --scene chain4 --design paper"):
         model.main(scene="chain4", beside="paper", json=tmp_path / "model.json")
 
 
@@ -140,15 +146,15 @@ def test_training_that_goes_on_keeps_the_mechanics_that_the_weights_correct(tmp_
 
 
 def test_training_that_goes_on_is_asked_for_no_size(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="size is 'tiny', but the networks of weights to go on from keep their own"):
+    with pytest.raises(InputError, match="size is 'tiny', but the networks of weights to go on from keep their own"):
         train.main(scene="chain4", size="tiny", folder=tmp_path / "run", start=stored.SHIPPED / "chain4.json")
     assert not (tmp_path / "run").exists()
 
 
 def test_other_bodies_than_a_human_are_not_asked_for_another_kick(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="reference is asked for, but the scene chains1 has no human"):
+    with pytest.raises(InputError, match="reference is asked for, but the scene chains1 has no human"):
         model.main(scene="chains1", reference=Path("kick.bvh"), json=tmp_path / "model.json")
-    with pytest.raises(ValueError, match="bodies varied is asked for, but the scene two_balls has no human"):
+    with pytest.raises(InputError, match="bodies varied is asked for, but the scene two_balls has no human"):
         model.main(scene="two_balls", bodies="varied", json=tmp_path / "model.json")
 
 
@@ -159,3 +165,59 @@ def test_varied_humans_around_the_kick_are_all_others_and_as_high_above_the_grou
     assert len(np.unique(episodes.morphology[:, rows, 2].sum(axis=1))) == len(episodes.states)
     above = clearance(chosen.scene.body("human"), episodes.states[:, 0, rows], episodes.morphology[:, rows])
     assert (np.abs(above) < 0.1).all()
+
+
+@pytest.mark.parametrize("name", list(SCENARIOS))
+def test_every_scene_can_be_trained(name: str) -> None:
+    """One update with gradients, of every network, down to shapes and types: compiling all of them takes too long."""
+    chosen, stage = SCENARIOS[name], train.stages_of(SCENARIOS[name])[0]
+    episodes, _ = chosen.draw(4, 1)
+    made, recipe = designs.hybrid(chosen.scene, designs.LEAST), replace(stage.recipe, batch=4)
+    drawn = Windows(chosen.scene, [(episodes, 1.0)], recipe).draw(np.random.default_rng(0), 1)
+
+    def update(key: Array) -> Any:
+        before, after = jnp.asarray(drawn.states[:, 0]), jnp.asarray(drawn.states[:, 1])
+        rest = drawn.controls[:, 0], drawn.torques[:, 0], drawn.morphology
+        weights = initial_weights(made, key, measure(made, before, after, *map(jnp.asarray, rest)))
+        state = training.optimiser(recipe).init(weights.networks)
+        return training.update_of(made, recipe, weights)(weights.networks, state, key, drawn, 1e-3)
+
+    networks, _, terms = jax.eval_shape(update, jax.random.key(0))
+    assert networks.keys() == made.networks().keys() and terms["loss"].shape == ()
+
+
+def test_a_run_goes_on_only_with_the_settings_that_it_was_begun_with(tmp_path: Path) -> None:
+    settings = {"episodes": 40, "seed": 100, "effort": 0.5, "size": None}
+    train.claim(tmp_path, settings)
+    train.claim(tmp_path, settings)
+    for name, value in (("episodes", 400), ("seed", 7), ("effort", 1.0), ("size", "tiny")):
+        other = f"{name} is {value!r}, but the run in .* was begun with {settings[name]!r}"
+        with pytest.raises(InputError, match=other):
+            train.claim(tmp_path, settings | {name: value})
+    (tmp_path / "settings.json").write_text("{")
+    with pytest.raises(InputError, match=r"its settings\.json is damaged"):
+        train.claim(tmp_path, settings)
+    (tmp_path / "settings.json").unlink()
+    (tmp_path / "random.npz").touch()
+    with pytest.raises(InputError, match="holds a run of unknown settings"):
+        train.claim(tmp_path, settings)
+
+
+def test_a_scene_of_ones_own_is_found_in_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "mine.py"
+    path.write_text(
+        "from larp_model import Scene, chain, human\n"
+        "from tasks.scenarios import SCENARIOS\n"
+        "ROPE, PERSON, DRAWN, OTHER = Scene((chain(links=3),)), Scene((human(),)), SCENARIOS['human'], 3\n"
+    )
+    rope = scenario(f"{path}:ROPE")
+    assert rope.name == "rope" and rope.draw(2, 0)[0].states.shape[2] == 3
+    assert scenario(f"{path}:DRAWN").name == "human"
+    for name, message in (
+        (f"{path}:ROPES", "did you mean 'ROPE'"),
+        (f"{path}:OTHER", "must be one of ROPE, PERSON, DRAWN"),
+        (f"{path}:PERSON", "has motors: make it a tasks.scenarios.Scenario"),
+        (f"{tmp_path}/mined.py:ROPE", "no such file exists; did you mean 'mine.py'"),
+    ):
+        with pytest.raises(InputError, match=message):
+            scenario(name)

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from larp_model import kinematics
 from larp_model.anatomy import ANATOMIES, Detail
 from larp_model.bodies import ball, capsule, chain, detail_of, human, human_and_ball, standing_height
+from larp_model.errors import InputError
 from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface, anchor
 
 NAN, INFINITY = math.nan, math.inf
@@ -53,7 +54,7 @@ PAIR = Pair("human", "ball", ("left_foot",), ("ball",), SURFACE)
     ],
 )
 def test_a_description_refuses_nonsense_by_field(description: Link, field: str, value: object) -> None:
-    with pytest.raises(ValueError, match=rf"\.{field} is .*but must ") as caught:
+    with pytest.raises(InputError, match=rf"\.{field} is .*but must ") as caught:
         dataclasses.replace(description, **{field: value})  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
 
@@ -96,7 +97,7 @@ def test_a_description_refuses_nonsense_by_field(description: Link, field: str, 
     ],
 )  # fmt: skip
 def test_a_builder_refuses_nonsense_by_name(build: Callable[[], object], message: str) -> None:
-    with pytest.raises(ValueError, match=message) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         build()
     assert "\n" not in str(caught.value)
 

@@ -14,6 +14,7 @@ from larp_model import designs
 from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.bodies import human_and_ball
+from larp_model.errors import InputError
 from larp_model.meeting import first_contacts, meetings
 from larp_model.networks import Weights
 from larp_model.parts.part import Model, initial_weights, measure
@@ -110,7 +111,7 @@ def test_weights_that_know_nothing_of_it_are_refused_and_can_be_had_without(
 ) -> None:
     model, weights = untrained
     manifest = stored.save(tmp_path, "passing", model.on(SCENE.between), weights, {})
-    with pytest.raises(ValueError, match="no part 'human-itself'"):
+    with pytest.raises(InputError, match="no part 'human-itself'"):
         stored.load(manifest, SCENE)
     known, learned, _ = stored.load(manifest, SCENE, partly=True)
     assert known.scene == SCENE.between

@@ -26,8 +26,9 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.sync.connection import Connection
 from websockets.typing import Subprotocol
 
+from larp_model.errors import InputError
 from viewer.checked import alike, flag, option, vector, within
-from viewer.server import LARGEST_MESSAGE, address_of, admits, close_server, names_of, open_server
+from viewer.server import LARGEST_MESSAGE, address_of, admits, close_server, names_of, open_server, require_address
 
 PROTOCOL = f"viser-v{viser.__version__}"
 UPGRADE = (
@@ -253,7 +254,7 @@ def test_a_busy_port_is_named(taken_by: Callable[[str, int], Any]) -> None:
         else:
             port = taken.get_port()
             stack.callback(close_server, taken)
-        with pytest.raises(ValueError, match=f"^port {port} of host '127.0.0.1' cannot be opened.*choose") as caught:
+        with pytest.raises(InputError, match=f"^port {port} of host '127.0.0.1' cannot be opened.*choose") as caught:
             open_server(port=port)
         assert "\n" not in str(caught.value)
 
@@ -262,7 +263,7 @@ def test_a_busy_port_is_named(taken_by: Callable[[str, int], Any]) -> None:
 def test_an_impossible_host_is_named_soon(host: str) -> None:
     """The addresses are reserved for documentation, the name for what does not exist: no machine has them."""
     began = time.monotonic()
-    with pytest.raises(ValueError, match=f"^host is {host!r}, but must be an address or a name") as caught:
+    with pytest.raises(InputError, match=f"^host is {host!r}, but must be an address or a name") as caught:
         open_server(host, 0)
     assert time.monotonic() - began < 2.0 and "\n" not in str(caught.value)
 
@@ -271,7 +272,7 @@ def test_a_host_that_nobody_answers_for_is_named_soon(monkeypatch: pytest.Monkey
     answered = threading.Event()
     monkeypatch.setattr("socket.getaddrinfo", lambda *_, **__: answered.wait(SOON) and [])
     began = time.monotonic()
-    with pytest.raises(ValueError, match=r"^host is 'slow\.example', .*: nobody knows it$"):
+    with pytest.raises(InputError, match=r"^host is 'slow\.example', .*: nobody knows it$"):
         open_server("slow.example", 0)
     assert time.monotonic() - began < 2.0
     answered.set()
@@ -279,7 +280,7 @@ def test_a_host_that_nobody_answers_for_is_named_soon(monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize("port", [-1, 65536, 80.0, "80"])
 def test_an_impossible_port_is_named(port: Any) -> None:
-    with pytest.raises(ValueError, match=f"^port is {port!r}, but must be an integer in"):
+    with pytest.raises(InputError, match=f"^port is {port!r}, but must be an integer in"):
         open_server(port=port)
 
 
@@ -525,3 +526,43 @@ def test_what_may_stand_for_a_value_is_of_its_kind_and_can_be_sent_to_all(value:
 )
 def test_what_a_browser_sends_of_a_control_may_stand_for_its_value(value: object, current: object) -> None:
     assert alike(value, current)
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "enters"),
+    [
+        ("hub.example:8000", "https://hub.example:8000", True),
+        ("127.0.0.1:8080", "https://hub.example", True),
+        ("HUB.example", None, True),
+        ("127.0.0.1:8080", "http://127.0.0.1:8080", True),
+        ("127.0.0.1:8080", "https://hub.example.evil.example", False),
+        ("127.0.0.1:8080", "https://evil.example", False),
+        ("evil.example", "https://hub.example", False),
+        ("evil.example", None, False),
+    ],
+)
+def test_a_proxy_that_is_named_may_ask_and_so_may_its_pages(host: str, origin: str | None, enters: bool) -> None:
+    names, headers = names_of("127.0.0.1", local=True), Headers(Host=host)
+    if origin is not None:
+        headers["Origin"] = origin
+    assert admits(headers, names, addresses=False, proxies=frozenset({"hub.example"})) is enters
+    if "hub.example" in host.lower() or origin == "https://hub.example":
+        assert not admits(headers, names, addresses=False), "it must be named"
+
+
+def test_a_server_behind_a_proxy_answers_it() -> None:
+    server = open_server(port=0, allowed=("Hub.example",))
+    try:
+        assert answer(server, "Host: 127.0.0.1:PORT", "Origin: https://hub.example", *UPGRADE) == 101
+        assert answer(server, "Host: 127.0.0.1:PORT", "Origin: https://evil.example", *UPGRADE) == 403
+    finally:
+        close_server(server)
+
+
+def test_an_address_that_is_free_stays_free_after_it_was_asked_for() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as found:
+        port = found.getsockname()[1]
+        with pytest.raises(InputError, match=f"port {port}"):
+            require_address("127.0.0.1", port)
+    require_address("127.0.0.1", port)
+    close_server(open_server("127.0.0.1", port))

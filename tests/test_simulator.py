@@ -10,11 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax import Array
+from jax import Array, export
 
 from larp_model import designs, losses, rotation
 from larp_model import state as packed
 from larp_model.bodies import BALL_SURFACE, capsule, chain
+from larp_model.errors import InputError
 from larp_model.kinematics import morphology_of
 from larp_model.losses import LossWeights
 from larp_model.meeting import first_contacts
@@ -257,13 +258,13 @@ def test_bodies_without_motors_that_strike_each_other_are_simulated() -> None:
 def test_shapes_that_do_not_fit_are_refused(
     compact_simulator: Simulator, state: tuple[int, ...], controls: tuple[int, ...], message: str
 ) -> None:
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(InputError, match=message):
         compact_simulator.rollout(jnp.zeros(state), jnp.zeros(controls))
 
 
 @pytest.mark.parametrize(("layers", "width", "named"), [(2, 0, "width is 0"), (0, 8, "layers is 0"), (2, 1.5, "1.5")])
 def test_a_size_that_makes_no_sense_is_refused_by_name(layers: int, width: int, named: str) -> None:
-    with pytest.raises(ValueError, match=named):
+    with pytest.raises(InputError, match=named):
         Size(layers, width)
 
 
@@ -305,3 +306,36 @@ def test_a_sequence_teaches_until_it_is_lost(scene: Scene, episodes: Episodes) -
     slope = np.asarray(jax.grad(loss)(strayed))[0, :, :, 0]
     np.testing.assert_allclose(loss(strayed), 0.5 * 0.1**2, rtol=1e-4)
     assert (slope[2:4] > 0.0).all() and not slope[4:].any()
+
+
+def test_an_empty_batch_gives_an_empty_answer(mechanical: Simulator, scene: Scene) -> None:
+    links, motors = len(scene.links), len(scene.motors)
+    state, controls = np.zeros((0, links, 13), np.float32), np.zeros((0, 5, motors, 3))
+    assert mechanical.rollout(state, controls).shape == (0, 5, links, 13)
+    assert mechanical.step(state, controls[:, 0]).shape == (0, links, 13)
+
+
+def test_arguments_that_are_no_arrays_of_numbers_are_refused_by_name(mechanical: Simulator, scene: Scene) -> None:
+    links, motors = len(scene.links), len(scene.motors)
+    state, control = np.zeros((1, links, 13), np.float32), np.zeros((1, motors, 3))
+    for arguments, name in (
+        (([[1.0], [1.0, 2.0]], control), "state is of type list"),
+        (("standing", control), "state is of type str"),
+        ((state, [[1.0], [1.0, 2.0]]), "controls is of type list"),
+        ((state, control, object()), "torques is of type object"),
+    ):
+        with pytest.raises(InputError, match=name):
+            mechanical.step(*arguments)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["chain4", "human_ball"])
+def test_a_rollout_can_be_exported_for_any_batch(name: str) -> None:
+    simulator = Simulator.load(name)
+    links, motors = len(simulator.scene.links), len(simulator.scene.motors)
+    (count,) = export.symbolic_shape("n")
+    given = (
+        jax.ShapeDtypeStruct((count, links, 13), jnp.float32),
+        jax.ShapeDtypeStruct((count, 5, motors, 3), jnp.float32),
+    )
+    exported = export.export(jax.jit(simulator.rollout))(*given)
+    assert exported.in_avals[0].shape == (count, links, 13)

@@ -15,7 +15,9 @@ from scipy.spatial.transform import Rotation
 from test_bvh import CLIPS, STANDING, swing, text, with_clips
 
 from larp_model.bodies import human
-from tasks.motions import angles, bvh, rest_pose, skeleton
+from larp_model.errors import InputError
+from larp_model.scene import Scene
+from tasks.motions import angles, bvh, references, rest_pose, skeleton
 from tasks.motions.skeleton import Motion
 
 LINKS = [human().links[child].name for child, _, _ in human().motors]
@@ -74,7 +76,7 @@ def test_ones_own_table_says_what_joints_are_called(tmp_path: Path) -> None:
 )
 def test_joints_that_are_not_there_are_named(tmp_path: Path, names: dict[str, str] | None, complaint: str) -> None:
     path = written(tmp_path, renamed(text(*swing(10)), {"Hips": "pelvis", "RightFoot": "r_ankle"}))
-    with pytest.raises(ValueError, match=complaint) as refusal:
+    with pytest.raises(InputError, match=complaint) as refusal:
         bvh.load(path, names)
     assert "\n" not in str(refusal.value)
 
@@ -83,9 +85,9 @@ def test_joints_that_are_not_there_are_named(tmp_path: Path, names: dict[str, st
 def test_a_table_that_is_none_is_refused_in_one_line(tmp_path: Path, content: str) -> None:
     path = tmp_path / "names.json"
     path.write_text(content)
-    with pytest.raises(ValueError, match=r"^names: names\.json (is no JSON file|needs an object)"):
+    with pytest.raises(InputError, match=r"^names: names\.json (is no JSON file|needs an object)"):
         bvh.names_in(path)
-    with pytest.raises(ValueError, match="no such file"):
+    with pytest.raises(InputError, match="no such file"):
         bvh.names_in(tmp_path / "none.json")
 
 
@@ -147,7 +149,7 @@ def test_without_a_t_pose_a_skeleton_moves_as_with_one(tmp_path_factory: pytest.
 def test_too_few_frames_make_no_rest_pose(tmp_path: Path) -> None:
     lying = {"Hips": (90.0, 0.0, 0.0), "LeftArm": (80.0, 0.0, 0.0)}
     path = written(tmp_path, text(lying, *[lying] * 5).replace("OFFSET 28 0 0", "OFFSET 0 0 28"))
-    with pytest.raises(ValueError, match=r"has no rest pose: .* 6 frames are too few"):
+    with pytest.raises(InputError, match=r"has no rest pose: .* 6 frames are too few"):
         bvh.load(path)
 
 
@@ -220,6 +222,35 @@ def test_arrays_that_are_no_motion_are_refused_in_one_line(
 ) -> None:
     kept = {name: value for name, value in (fields() | changed).items() if value is not None}
     np.savez(tmp_path / "kick.npz", **kept)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=complaint) as refusal:
+    with pytest.raises(InputError, match=complaint) as refusal:
         angles.load(tmp_path / "kick.npz")
     assert "\n" not in str(refusal.value) and "kick.npz" in str(refusal.value)
+
+
+def kicking(before: int, lying: bool = False) -> Motion:
+    """One who stands, or lies, and swings the right leg, fastest after so many of 40 frames."""
+    given_fields, thigh = fields(), LINKS.index("right_thigh")
+    for name in ("position", "orientation", "angles"):
+        given_fields[name] = np.repeat(given_fields[name][:1], 40, axis=0)
+    given_fields["angles"][:, thigh, 1] = -np.tanh((np.arange(40) - before) / 8.0)
+    if lying:
+        given_fields["orientation"][:] = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
+    return angles.motion(**given_fields)  # type: ignore[arg-type]
+
+
+def test_a_kick_that_begins_with_its_strike_or_of_one_who_lies_is_refused_before_it_is_performed(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Performed(Exception):
+        pass
+
+    def perform(*arguments: object) -> None:
+        raise Performed
+
+    monkeypatch.setattr(references, "Tracker", perform)
+    with pytest.raises(Performed):
+        references.captured(kicking(20), scene)
+    with pytest.raises(InputError, match=r"the motion begins 0\.0\d s before its strike, but needs 0\.11 s"):
+        references.captured(kicking(1), scene)
+    with pytest.raises(InputError, match=r"no kick of one who stands: .*is the file's up axis another one\?"):
+        references.captured(kicking(20, lying=True), scene)

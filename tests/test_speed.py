@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from larp_model.errors import InputError
 from larp_model.kinematics import morphology_of
 from larp_model.meeting import gatherings, within_reach
 from larp_model.scene import Scene
@@ -133,7 +134,7 @@ def test_brax_says_in_its_own_words_why_it_does_not_take_the_human() -> None:
     ],
 )
 def test_wrong_arguments_are_refused_by_name(arguments: dict[str, str | int], told: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(InputError, match=told):
         speed.main(**arguments, json=tmp_path / "speed.json")  # type: ignore[arg-type]
 
 

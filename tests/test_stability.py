@@ -13,6 +13,7 @@ import pytest
 
 from larp_model import state as packed
 from larp_model.bodies import ball
+from larp_model.errors import InputError
 from larp_model.networks import Weights
 from larp_model.parts.part import Model
 from larp_model.scene import Scene
@@ -47,9 +48,9 @@ def lying_ball(count: int = 1) -> np.ndarray:
 @pytest.mark.parametrize("kind", [jnp.bfloat16, jnp.float16, jnp.int32])
 def test_numbers_that_are_too_coarse_are_refused_by_name(ball_model: Simulator, kind: jnp.dtype) -> None:
     state = jnp.asarray(lying_ball(), kind)
-    with pytest.raises(ValueError, match="state has numbers of type"):
+    with pytest.raises(InputError, match="state has numbers of type"):
         ball_model.step(state, jnp.zeros((1, 0, 3)))
-    with pytest.raises(ValueError, match="state has numbers of type"):
+    with pytest.raises(InputError, match="state has numbers of type"):
         ball_model.rollout(state, jnp.zeros((1, 4, 0, 3)))
 
 
@@ -67,7 +68,7 @@ def test_a_prediction_is_flagged_from_where_it_diverges_and_no_other_row_with_it
     [("torques", jnp.zeros((1, 3, 1, 3))), ("morphology", jnp.zeros((2, 1, 3))), ("morphology", jnp.zeros(3))],
 )
 def test_arguments_that_do_not_fit_are_refused_by_name(ball_model: Simulator, name: str, value: jax.Array) -> None:
-    with pytest.raises(ValueError, match=f"{name} ha"):
+    with pytest.raises(InputError, match=f"{name} ha"):
         ball_model.rollout(jnp.asarray(lying_ball()), jnp.zeros((1, 4, 0, 3)), **{name: value})
 
 
@@ -170,5 +171,5 @@ def test_every_case_has_a_place_in_the_picture() -> None:
 
 
 def test_too_few_scenes_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="scenes is 3"):
+    with pytest.raises(InputError, match="scenes is 3"):
         stability.main(scenes=3, json=tmp_path / "stability.json")

@@ -17,6 +17,7 @@ from matplotlib.image import imread
 
 from larp_model import designs, training
 from larp_model.bodies import chain, two_balls
+from larp_model.errors import InputError
 from larp_model.meeting import first_contacts
 from larp_model.networks import Weights
 from larp_model.parts.part import Model
@@ -74,7 +75,7 @@ def test_sources_are_drawn_by_their_shares(swings: Episodes) -> None:
 
 
 def test_windows_longer_than_the_episodes_are_refused(swings: Episodes) -> None:
-    with pytest.raises(ValueError, match="episodes have 20 steps, but the unroll needs 21"):
+    with pytest.raises(InputError, match="episodes have 20 steps, but the unroll needs 21"):
         Windows(SWING, [(swings, 1.0)], SHORT).draw(np.random.default_rng(0), 21)
 
 
@@ -87,7 +88,7 @@ def test_the_curriculum_unrolls_as_it_says() -> None:
     ("field", "value"), [("updates", 0), ("batch", 0), ("curriculum", ((4, 0.5),)), ("curriculum", ())]
 )
 def test_a_recipe_refuses_nonsense_by_field(field: str, value: object) -> None:
-    with pytest.raises(ValueError, match=f"recipe.{field} is"):
+    with pytest.raises(InputError, match=f"recipe.{field} is"):
         Recipe(**{field: value})  # type: ignore[arg-type]
 
 

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from larp_model import kinematics
 from larp_model import state as packed
 from larp_model.bodies import ball, capsule, chain, human, standing_height
+from larp_model.errors import InputError
 from larp_model.meeting import first_contacts
 from larp_model.scene import Scene
 from larp_model.truth.episodes import VERSION, Episodes, join, load, record, save
@@ -223,14 +224,14 @@ def test_sizes_that_are_none_are_refused_by_link(scene: Scene) -> None:
     truth = Truth(scene, 2)
     morphology = np.tile([(link.length, link.radius, link.mass) for link in scene.links], (2, 1, 1))
     morphology[1, 2, 1] = -0.1
-    with pytest.raises(ValueError, match=r"link 'head'.radius is -0.1"):
+    with pytest.raises(InputError, match=r"link 'head'.radius is -0.1"):
         truth.resize(morphology)
-    with pytest.raises(ValueError, match=r"morphology has shape \(1, 14, 3\), but needs \(2, 14, 3\)"):
+    with pytest.raises(InputError, match=r"morphology has shape \(1, 14, 3\), but needs \(2, 14, 3\)"):
         truth.resize(morphology[:1])
 
 
 def test_substeps_must_be_positive(scene: Scene) -> None:
-    with pytest.raises(ValueError, match="substeps is 0"):
+    with pytest.raises(InputError, match="substeps is 0"):
         Truth(scene, substeps=0)
 
 
@@ -285,14 +286,14 @@ def test_episodes_that_do_not_fit_are_refused(
     stored: Path, scene: Scene, changes: dict[str, np.ndarray], message: str
 ) -> None:
     rewrite(stored, **changes)
-    with pytest.raises(ValueError, match=message) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         load(stored, scene)
     assert str(stored) in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_damaged_or_missing_episodes_are_refused(stored: Path, scene: Scene) -> None:
     stored.write_bytes(stored.read_bytes()[:-1000])
-    with pytest.raises(ValueError, match="cannot be read"):
+    with pytest.raises(InputError, match="cannot be read"):
         load(stored, scene)
-    with pytest.raises(ValueError, match="does not exist"):
+    with pytest.raises(InputError, match="does not exist"):
         load(stored.with_name("none.npz"), scene)

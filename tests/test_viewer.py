@@ -18,6 +18,7 @@ from matplotlib.image import imread
 from scipy.spatial.transform import Rotation
 
 from larp_model.bodies import human_and_ball
+from larp_model.errors import InputError
 from larp_model.state import ORIENTATION, POSITION, VELOCITY
 from viewer import LivePage, Recording, check_film, kick_picture, nearest_approach, write_film, write_html
 from viewer.app import Moment, News
@@ -115,7 +116,7 @@ def test_nearest_approach_lies_between_states(along: float, miss: float, offset:
 
 def test_nearest_approach_of_a_resting_ball() -> None:
     assert nearest_approach(np.zeros((5, 3)), np.array([0.0, 3.0, 4.0])).distance == pytest.approx(5.0)
-    with pytest.raises(ValueError, match=r"path has shape \(0, 3\)"):
+    with pytest.raises(InputError, match=r"path has shape \(0, 3\)"):
         nearest_approach(np.zeros((0, 3)), np.zeros(3))
 
 
@@ -132,7 +133,7 @@ def test_nearest_approach_of_a_resting_ball() -> None:
     ],
 )
 def test_recording_refuses_nonsense(recording: Recording, field: str, value: object) -> None:
-    with pytest.raises(ValueError, match=f"^{field} "):
+    with pytest.raises(InputError, match=f"^{field} "):
         replace(recording, **{field: value})  # type: ignore[arg-type]
 
 
@@ -179,7 +180,7 @@ def test_states_that_come_in_bursts_are_drawn_in_order_and_never_far_behind(burs
 
 
 def test_update_needs_a_scene(page: LivePage, recording: Recording) -> None:
-    with pytest.raises(ValueError, match="before begin"):
+    with pytest.raises(InputError, match="before begin"):
         page.update(recording.states[0], None, 0.0)
 
 
@@ -284,7 +285,7 @@ def test_a_film_is_written_in_the_format_of_its_name(suffix: str, recording: Rec
 
 
 def test_a_film_of_no_known_format_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"video is 'kick.avi', but its name must end in .mp4 or .gif"):
+    with pytest.raises(InputError, match=r"video is 'kick.avi', but its name must end in .mp4 or .gif"):
         check_film("kick.avi")
 
 

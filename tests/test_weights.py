@@ -15,6 +15,7 @@ import pytest
 
 from larp_model import designs
 from larp_model.bodies import ball, capsule, human, human_and_ball, human_and_capsule
+from larp_model.errors import InputError
 from larp_model.networks import Weights
 from larp_model.parts.part import Model, initial_weights, measure
 from larp_model.scene import Body, Scene
@@ -90,7 +91,7 @@ def test_saving_twice_writes_the_same_bytes(stored: Path, compact: Model, compac
 
 def refusal(stored: Path, scene: Scene) -> str:
     """What `load` says when it refuses; one line that names a file."""
-    with pytest.raises(ValueError) as caught:
+    with pytest.raises(InputError) as caught:
         load(stored, scene)
     assert "\n" not in str(caught.value) and str(stored.with_suffix("")) in str(caught.value)
     return str(caught.value)

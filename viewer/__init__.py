@@ -7,6 +7,7 @@ from viewer.picture import kick_picture
 from viewer.recording import Approach, Recording, nearest_approach
 from viewer.replay import framed, page_of, write_html
 from viewer.scene_view import SceneView
+from viewer.server import require_address
 from viewer.wishes import Offer, Push, Wishes
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "kick_picture",
     "nearest_approach",
     "page_of",
+    "require_address",
     "show",
     "write_film",
     "write_html",

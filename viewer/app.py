@@ -10,7 +10,7 @@ import queue
 import threading
 import time as clock
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from types import TracebackType
@@ -19,6 +19,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import viser
 
+from larp_model.errors import InputError
 from larp_model.scene import Scene
 from larp_model.state import POSITION
 from viewer.camera import VIEWS, View
@@ -86,8 +87,15 @@ class LivePage:
     `asked`. Leaving the `with` block closes the page.
     """
 
-    def __init__(self, host: str = "127.0.0.1", port: int = 8080, offer: Offer | None = None) -> None:
-        self._server = open_server(host, port)
+    def __init__(
+        self,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        offer: Offer | None = None,
+        allowed: Sequence[str] = (),
+    ) -> None:
+        """allowed: names of proxies by which the page is reached, too; see `server.open_server`."""
+        self._server = open_server(host, port, allowed)
         self.address = address_of(self._server)
         self.offer = offer
         self._lock, self._closed, self._moved = threading.RLock(), threading.Event(), threading.Event()
@@ -286,7 +294,7 @@ class LivePage:
         """
         with self._lock:
             if self._stage is None:
-                raise ValueError("update came before begin, but the page needs a scene first")
+                raise InputError("update came before begin, but the page needs a scene first")
             if self._mode != "running":
                 self._mode, self._recording, self._beside, self._single = "running", None, None, 0
                 self._news, self._panel.playing = News(np.array(state), time), True

@@ -19,6 +19,7 @@ from matplotlib.patches import Circle
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
+from larp_model.errors import InputError
 from larp_model.files import write_whole
 from larp_model.state import ORIENTATION, POSITION
 from viewer.camera import Camera, around
@@ -39,12 +40,12 @@ def check_film(path: str | Path) -> None:
     """Refuses, at once, a path that no film can be written to."""
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
-        raise ValueError(f"video is {str(path)!r}, but its name must end in {' or '.join(SUFFIXES)}")
+        raise InputError(f"video is {str(path)!r}, but its name must end in {' or '.join(SUFFIXES)}")
     if suffix == ".mp4":
         try:
             import imageio_ffmpeg  # noqa: F401
         except ImportError:
-            raise ValueError("video: mp4 needs an encoder: pip install 'larp-mpc[video]', or ask for a .gif") from None
+            raise InputError("video: mp4 needs an encoder: pip install 'larp-mpc[video]', or ask for a .gif") from None
 
 
 def write_film(recording: Recording, path: str | Path, size: tuple[int, int] = (1280, 720), rate: float = 30.0) -> None:

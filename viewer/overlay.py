@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from larp_model.errors import InputError
 from larp_model.files import write_whole
 from larp_model.scene import Scene
 from larp_model.state import SIZE
@@ -47,9 +48,9 @@ class Overlay:
         for name in ("states", "start"):
             value = getattr(self, name)
             if np.ndim(value) != 3 or value.shape[1:] != (links, SIZE) or not np.isfinite(value).all():
-                raise ValueError(f"{name} has shape {np.shape(value)}, but needs finite (T, {links}, {SIZE})")
+                raise InputError(f"{name} has shape {np.shape(value)}, but needs finite (T, {links}, {SIZE})")
         if np.ndim(self.seen) != 3 or np.shape(self.seen) != np.shape(self.found) or np.shape(self.seen)[2] != 3:
-            raise ValueError(f"seen and found have shapes {np.shape(self.seen)} and {np.shape(self.found)}, not one")
+            raise InputError(f"seen and found have shapes {np.shape(self.seen)} and {np.shape(self.found)}, not one")
 
     def at(self, row: int) -> np.ndarray:
         """Keypoints and their points on the human (K, 2, 3) [m] of the frame nearest to a row of the states."""

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from larp_model.errors import InputError
 from larp_model.scene import Scene
 from larp_model.state import POSITION, SIZE
 from mpc.cost import nearest_on_path
@@ -26,7 +27,7 @@ def nearest_approach(path: np.ndarray, target: np.ndarray) -> Approach:
     """Where a path (T, 3) [m] passes nearest to `target` (3,) [m]; see `mpc.nearest_on_path`."""
     path, target = np.asarray(path, float), np.asarray(target, float)
     if path.ndim != 2 or path.shape[1] != 3 or not len(path):
-        raise ValueError(f"path has shape {path.shape}, but needs (T, 3) with at least one point")
+        raise InputError(f"path has shape {path.shape}, but needs (T, 3) with at least one point")
     point, row = nearest_on_path(np.append(path, path[-1:], axis=0), target)
     return Approach(float(np.linalg.norm(point - target)), point, int(row))
 
@@ -70,17 +71,17 @@ class Recording:
             if value is None and name != "states":
                 continue
             if np.ndim(value) != 3 or np.shape(value)[1:] != (links, SIZE) or not len(value):
-                raise ValueError(f"{name} has shape {np.shape(value)}, but needs (T > 0, {links}, {SIZE})")
+                raise InputError(f"{name} has shape {np.shape(value)}, but needs (T > 0, {links}, {SIZE})")
             if not np.all(np.isfinite(value)):
-                raise ValueError(f"{name} holds values that are not finite, but all must be")
+                raise InputError(f"{name} holds values that are not finite, but all must be")
         if np.shape(self.target) != (3,) or not np.all(np.isfinite(self.target)):
-            raise ValueError(f"target is {self.target!r}, but must be three finite numbers")
+            raise InputError(f"target is {self.target!r}, but must be three finite numbers")
         if not 0 <= self.predicted_start < len(self.states):
-            raise ValueError(
+            raise InputError(
                 f"predicted_start is {self.predicted_start!r}, but must be a row in [0, {len(self.states)})"
             )
         if not -links <= self.traced < links:
-            raise ValueError(f"traced is {self.traced!r}, but must be a row in [{-links}, {links})")
+            raise InputError(f"traced is {self.traced!r}, but must be a row in [{-links}, {links})")
 
     @property
     def duration(self) -> float:

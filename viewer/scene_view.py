@@ -11,6 +11,7 @@ import viser
 from scipy.spatial.transform import Rotation
 from trimesh.creation import revolve, uv_sphere
 
+from larp_model.errors import InputError
 from larp_model.scene import Link, Scene
 from larp_model.state import ORIENTATION, POSITION, SIZE
 
@@ -160,7 +161,7 @@ class SceneView:
     def update(self, state: np.ndarray | None) -> None:
         """Move the links to a state (L, 13); hide those whose state is not known (NaN), or all if it is None."""
         if state is not None and np.shape(state) != (self._links, SIZE):
-            raise ValueError(f"state has shape {np.shape(state)}, but needs ({self._links}, {SIZE})")
+            raise InputError(f"state has shape {np.shape(state)}, but needs ({self._links}, {SIZE})")
         with self._server.atomic():
             self._root.visible = state is not None
             if state is None:

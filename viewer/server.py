@@ -8,7 +8,7 @@ import re
 import socket
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout, suppress
 from errno import EACCES, EADDRINUSE
 from http import HTTPStatus
@@ -23,6 +23,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
+from larp_model.errors import InputError
 from viewer.checked import alike
 
 RESOLVING = 1.5  # s until a host's name must be known
@@ -49,20 +50,30 @@ FIELDS: dict[str, Any] = {
 
 _STARTING = threading.Lock()
 _HOST = re.compile(r"(\[[0-9a-f:.]+\]|[^\[\]:]+)(:[0-9]{1,5})?")
+_ORIGIN = re.compile(rf"https?://({_HOST.pattern})")
+_NAME = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)*")
 
 
-def open_server(host: str = "127.0.0.1", port: int = 8080) -> viser.ViserServer:
+def require_address(host: str, port: int, allowed: Sequence[str] = ()) -> None:
+    """Refuse what `open_server` would refuse, without opening anything for longer than a moment."""
+    _checked_names(allowed)
+    _listening(host, port).close()
+
+
+def open_server(host: str = "127.0.0.1", port: int = 8080, allowed: Sequence[str] = ()) -> viser.ViserServer:
     """A silent Viser server on exactly this address; port 0 takes a free one.
 
-    It answers only requests for this address that come from its own page or from no page at all. A host that others
-    can reach is warned of on stderr. Raises ValueError where the address cannot be had: Viser itself would move to
-    another port, or try for ever.
+    It answers only requests for this address that come from its own page or from no page at all. allowed: other names,
+    without ports, by which a proxy before it is reached, and whose pages may ask. A host that others can reach is
+    warned of on stderr. Raises InputError where the address cannot be had: Viser itself would move to another port, or
+    try for ever.
     """
+    proxies = _checked_names(allowed)
     listening = _listening(host, port)
     local = is_loopback(listening.getsockname()[0])
     try:
         with redirect_stdout(io.StringIO()):
-            server = _Server(host, listening, local)
+            server = _Server(host, listening, local, proxies)
     except BaseException:
         listening.close()
         raise
@@ -93,17 +104,22 @@ def names_of(host: str, local: bool) -> frozenset[str]:
     return frozenset(name.lower() for name in ("localhost", _bracketed(host), *here))
 
 
-def admits(headers: Headers, names: frozenset[str], addresses: bool) -> bool:
+def admits(headers: Headers, names: frozenset[str], addresses: bool, proxies: frozenset[str] = frozenset()) -> bool:
     """Whether a request is for one of these names and, where a page sent it, from the page of this very server.
 
-    addresses: whether any IP address will do as a name. To reach us, the page of another site must be served under
-    a name that its owner first has resolve to itself and then to us; it is that name which gives it away.
+    addresses: whether any IP address will do as a name. proxies: names that a request may be for as well, and whose
+    pages may send it, for a proxy may put our address into the request and leave its own in the page's. To reach us,
+    the page of another site must be served under a name that its owner first has resolve to itself and then to us; it
+    is that name which gives it away.
     """
     hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
     asked = _HOST.fullmatch(hosts[0].lower()) if len(hosts) == 1 else None
-    if asked is None or not (asked[1] in names or (addresses and _is_address(asked[1]))):
+    if asked is None or not (asked[1] in names | proxies or (addresses and _is_address(asked[1]))):
         return False
-    return not origins or [origin.lower() for origin in origins] in ([f"http://{asked[0]}"], [f"https://{asked[0]}"])
+    if not origins:
+        return True
+    origin = _ORIGIN.fullmatch(origins[0].lower()) if len(origins) == 1 else None
+    return origin is not None and (origin[1] == asked[0] or origin[2] in proxies)
 
 
 def is_sound(raw: str | bytes) -> bool:
@@ -131,8 +147,11 @@ class _Connection(ServerConnection):
 class _Server(viser.ViserServer):
     """Viser has no hook for whom to serve, so for its start it meets another `serve` in the place of websockets'."""
 
-    def __init__(self, host: str, listening: socket.socket, local: bool) -> None:
-        """listening: bound to the host, which is local if only this machine reaches it. Closed by `stop`."""
+    def __init__(self, host: str, listening: socket.socket, local: bool, proxies: frozenset[str]) -> None:
+        """listening: bound to the host, which is local if only this machine reaches it. Closed by `stop`.
+
+        proxies: see `admits`.
+        """
         names = names_of(host, local)
         self._served: listener.serve | None = None
         with _STARTING:
@@ -142,7 +161,7 @@ class _Server(viser.ViserServer):
                 viser_server = vars(self).get("_websock_server")
                 if viser_server is None or viser_server._server_thread is not threading.current_thread():
                     return serve(handler, *address, **options)  # for someone else in this process
-                options["process_request"] = _guard(options["process_request"], names, not local)
+                options["process_request"] = _guard(options["process_request"], names, not local, proxies)
                 options["create_connection"] = _Connection
                 options["max_size"] = LARGEST_MESSAGE
                 options["logger"] = logging.Logger("viewer", logging.CRITICAL)  # or strangers write to our terminal
@@ -193,26 +212,35 @@ class _Server(viser.ViserServer):
 Answer = Callable[[ServerConnection, Request], Response | None]
 
 
-def _guard(answer: Answer, names: frozenset[str], addresses: bool) -> Answer:
+def _guard(answer: Answer, names: frozenset[str], addresses: bool, proxies: frozenset[str]) -> Answer:
     def guarded(connection: ServerConnection, request: Request) -> Response | None:
-        if admits(request.headers, names, addresses):
+        if admits(request.headers, names, addresses, proxies):
             return answer(connection, request)
-        return connection.respond(HTTPStatus.FORBIDDEN, "This page is served only under its own address.\n")
+        refusal = "This page is served only under its own address; --allow-host NAME admits a proxy's.\n"
+        return connection.respond(HTTPStatus.FORBIDDEN, refusal)
 
     return guarded
+
+
+def _checked_names(allowed: Sequence[str]) -> frozenset[str]:
+    """Hosts' names in lower case; refuses what is none, a port or an address of a page say."""
+    for name in allowed:
+        if not _NAME.fullmatch(name.lower()):
+            raise InputError(f"allow_host has {name!r}, but needs hosts' names without port, such as hub.example.org")
+    return frozenset(name.lower() for name in allowed)
 
 
 def _listening(host: str, port: int) -> socket.socket:
     """A socket that listens there, so that nobody can take the port between the question and the answer."""
     if not isinstance(port, int) or not 0 <= port < 2**16:
-        raise ValueError(f"port is {port!r}, but must be an integer in [0, 65536)")
+        raise InputError(f"port is {port!r}, but must be an integer in [0, 65536)")
     try:
         family, address = _resolved(host, port)
         return socket.create_server(address, family=family)
     except OSError as error:
         if error.errno in (EACCES, EADDRINUSE):
-            raise ValueError(f"port {port} of host {host!r} cannot be opened: {error}; choose another") from None
-        raise ValueError(f"host is {host!r}, but must be an address or a name of this machine: {error}") from None
+            raise InputError(f"port {port} of host {host!r} cannot be opened: {error}; choose another") from None
+        raise InputError(f"host is {host!r}, but must be an address or a name of this machine: {error}") from None
 
 
 def _resolved(host: str, port: int) -> tuple[socket.AddressFamily, Any]:

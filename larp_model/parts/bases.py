@@ -65,7 +65,7 @@ class OverMechanics:
             velocities,
         ]  # fmt: skip
         turned = rotation.about_z(jnp.concatenate(vectors, axis=1), rotation.opposite(turn)[:, None])
-        sizes = jnp.broadcast_to(seen.morphology, (len(state), links, 3))
+        sizes = jnp.broadcast_to(seen.morphology, (state.shape[0], links, 3))
         inputs = side_by_side(turned, position[..., 2], sizes, ends)
         after = Velocities(free.velocity, free.spin)
         return Known(changes_of(state, after, free.moved, free.turned, dt), turn, inputs)
@@ -86,7 +86,7 @@ def paper_inputs(body: Body, seen: Kinematics, control: Array, torque: Array) ->
     control (B, j, 3), torque (B, n, 3). Root-relative position, rotation matrix, velocities, displacement, torque;
     height, target quaternion, length and radius.
     """
-    state, size, links = seen.state, len(seen.state), len(body.links)
+    state, size, links = seen.state, seen.state.shape[0], len(body.links)
     position = packed.position(state)
     vectors = [
         position - position[:, :1],

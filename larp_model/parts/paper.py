@@ -53,7 +53,7 @@ class PaperBody:
 
     def respond(self, weights: Weights, seen: Kinematics, moving: Moving, hits: Hits) -> Array:
         """See `BodyPart`."""
-        size, links = len(seen.state), len(self.body.links)
+        size, links = seen.state.shape[0], len(self.body.links)
         inputs = side_by_side(moving.kept, hits.scaled(self.scale))
         outputs = evaluate(self.networks()[self.name], weights, self.name, inputs)
         outputs = weights.outputs[self.name].restore(bounded(outputs, self.bound))
@@ -102,7 +102,7 @@ class PaperContact:
         network, pooled = self.networks()[self.name], []
         rows = meeting.rows_of(self.pair, *self.bodies)
         for own, links, inputs in zip(seen, rows, self.inputs(seen), strict=True):
-            onto = jax.nn.one_hot(links, len(own.state[0]), dtype=inputs.dtype)
+            onto = jax.nn.one_hot(links, own.state.shape[1], dtype=inputs.dtype)
             push = jnp.einsum("bpf,pl->blf", evaluate(network, weights, self.name, inputs), onto)
             pooled.append(Hits.none(own)._replace(push=push))
         return pooled[0], pooled[1]
@@ -122,7 +122,7 @@ class PaperContact:
         root = seen[0].state[:, :1, :3] * jnp.array([1.0, 1.0, 0.0], seen[0].state.dtype)
 
         def phi(own: Kinematics, links: np.ndarray) -> Array:
-            sizes = jnp.broadcast_to(own.morphology[:, links], (len(own.state), len(links), 3))
+            sizes = jnp.broadcast_to(own.morphology[:, links], (own.state.shape[0], len(links), 3))
             state = own.state[:, links]
             return jnp.concatenate([packed.position(state) - root, state[..., 3:], sizes], axis=-1)
 

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from larp_model.errors import InputError
 from larp_model.kinematics import Kinematics, kinematics, morphology_of
 from larp_model.meeting import Velocities
 from larp_model.networks import Measured, Perceptron, Weights
@@ -195,7 +196,7 @@ def assemble(scene: Scene, parts: Sequence[BodyPart | PairPart]) -> Model:
 
     def found(*bodies: Body) -> Any:
         if name_of(*bodies) not in known:
-            raise ValueError(f"there is no part {name_of(*bodies)!r} for this scene, but {', '.join(known)}")
+            raise InputError(f"there is no part {name_of(*bodies)!r} for this scene, but {', '.join(known)}")
         return known[name_of(*bodies)]
 
     own = tuple(replace(found(body), body=body) for body in scene.bodies)

@@ -33,6 +33,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
+from larp_model.errors import InputError
 from larp_model.scene import Body, Link, Scene, Surface, Vector, anchor
 from larp_model.truth.mujoco import SUBSTEPS, finite
 
@@ -133,12 +134,12 @@ def _soft_bodies(scene: Scene) -> set[str]:
     soft = set(lighter.values())
     for pair, name in lighter.items():
         if pair.surface != scene.body(name).surface:
-            raise ValueError(
+            raise InputError(
                 f"scene.pairs gives {pair.first!r} and {pair.second!r} the surface {pair.surface}, but Bullet needs "
                 f"that of the lighter one, {name!r}: {scene.body(name).surface}"
             )
         if {pair.first, pair.second} <= soft:
-            raise ValueError(
+            raise InputError(
                 f"scene.pairs ties {pair.first!r} and {pair.second!r}, but in Bullet one of them must not be the "
                 "lighter one of any pair"
             )
@@ -152,7 +153,7 @@ class _World:
         self._engine, self._trees = engine, trees
         self._client = engine.connect(engine.DIRECT)
         if self._client < 0:
-            raise ValueError("batch is more than the simulations that pybullet can hold at once")
+            raise InputError("batch is more than the simulations that pybullet can hold at once")
         self._end = weakref.finalize(self, engine.disconnect, self._client)
         self.call("setGravity", 0.0, 0.0, -scene.gravity)
         self.call("setPhysicsEngineParameter", fixedTimeStep=step, numSubSteps=divisions, enableConeFriction=1)
@@ -335,7 +336,7 @@ class BulletTruth:
         self._worlds: list[_World] = []
         for name, value in (("batch", batch), ("substeps", substeps)):
             if value < 1:
-                raise ValueError(f"{name} is {value!r}, but must be at least 1")
+                raise InputError(f"{name} is {value!r}, but must be at least 1")
         self.scene = scene
         self.substeps = substeps
         self._fill([scene] * batch)
@@ -345,7 +346,7 @@ class BulletTruth:
         try:
             import pybullet
         except ImportError:
-            raise ValueError("pybullet is not installed: pip install 'larp-mpc[bullet]'") from None
+            raise InputError("pybullet is not installed: pip install 'larp-mpc[bullet]'") from None
         self.close()
         step = self.scene.dt / self.substeps
         divisions = max(_divisions(body.surface, step) for body in self.scene.bodies)
@@ -358,7 +359,7 @@ class BulletTruth:
         """Give the links of each simulation their lengths [m], radii [m] and masses [kg], (N, L, 3); then `reset`."""
         needed = (self.batch, len(self.scene.links), 3)
         if np.shape(morphology) != needed:
-            raise ValueError(f"morphology has shape {np.shape(morphology)}, but needs {needed}")
+            raise InputError(f"morphology has shape {np.shape(morphology)}, but needs {needed}")
         self._fill([self.scene.sized(each) for each in morphology])
 
     def close(self) -> None:

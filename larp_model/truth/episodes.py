@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from larp_model import state as packed
+from larp_model.errors import InputError
 from larp_model.files import written_whole
 from larp_model.scene import Scene
 from larp_model.truth.mujoco import Truth
@@ -48,7 +49,7 @@ def record(
     """
     count, links = len(states), len(truth.scene.links)
     if controls.shape[0] != count:
-        raise ValueError(f"controls hold {controls.shape[0]} episodes, but states hold {count}")
+        raise InputError(f"controls hold {controls.shape[0]} episodes, but states hold {count}")
     if torques is None:
         torques = np.zeros((*controls.shape[:2], links, 3), np.float32)
     sizes = np.broadcast_to(truth.scene.morphology, (count, links, 3)) if morphology is None else morphology
@@ -90,11 +91,11 @@ def load(path: Path, scene: Scene) -> Episodes:
             header = dict(json.loads(str(file["header"])))
             episodes = Episodes(*(file[name] for name in Episodes._fields))
     except FileNotFoundError:
-        raise ValueError(f"episodes file {path} does not exist") from None
+        raise InputError(f"episodes file {path} does not exist") from None
     except Exception as error:  # numpy and zipfile raise many kinds for a damaged file
-        raise ValueError(f"episodes file {path} cannot be read: {type(error).__name__}: {error}") from None
+        raise InputError(f"episodes file {path} cannot be read: {type(error).__name__}: {error}") from None
     if header.get("version") != VERSION:
-        raise ValueError(f"episodes file {path} is of version {header.get('version')}, but {VERSION} is needed")
+        raise InputError(f"episodes file {path} is of version {header.get('version')}, but {VERSION} is needed")
     links, motors = len(scene.links), len(scene.motors)
     steps = episodes.controls.shape[1] if episodes.controls.ndim == 4 else 0
     count = len(episodes.states)
@@ -107,11 +108,11 @@ def load(path: Path, scene: Scene) -> Episodes:
     for name, shape in expected.items():
         found = getattr(episodes, name)
         if found.shape != shape:
-            raise ValueError(f"episodes file {path}: {name} has shape {found.shape}, but the scene needs {shape}")
+            raise InputError(f"episodes file {path}: {name} has shape {found.shape}, but the scene needs {shape}")
         if not np.isfinite(found).all():
-            raise ValueError(f"episodes file {path}: {name} holds values that are not finite")
+            raise InputError(f"episodes file {path}: {name} holds values that are not finite")
     if header.get("links") != [link.name for link in scene.links] or header.get("dt") != scene.dt:
-        raise ValueError(
+        raise InputError(
             f"episodes file {path} is of another scene: links {header.get('links')}, dt {header.get('dt')}"
         )
     return episodes

@@ -7,6 +7,7 @@ A step of `scene.dt` takes several engine steps, because the engine's usual step
 from __future__ import annotations
 
 import os
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,6 +15,7 @@ from mujoco.batch import Batch
 from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
+from larp_model.errors import InputError
 from larp_model.scene import Body, Link, Scene, Surface, anchor
 
 # Halving the engine's step beyond this moves the ball's launch velocity by less than 1 % (median).
@@ -27,7 +29,7 @@ FARTHEST = 1e3
 def compile_model(scene: Scene, substeps: int = SUBSTEPS) -> mujoco.MjModel:
     """The MuJoCo model of a scene, its sensors laid out as the packed state."""
     if substeps < 1:
-        raise ValueError(f"substeps is {substeps!r}, but must be at least 1")
+        raise InputError(f"substeps is {substeps!r}, but must be at least 1")
     spec = mujoco.MjSpec()
     spec.option.timestep = scene.dt / substeps
     spec.option.gravity = [0.0, 0.0, -scene.gravity]
@@ -108,11 +110,25 @@ class Truth:
         """batch: simulations side by side. substeps: engine steps in one `scene.dt`. threads: 0 takes all `cores`."""
         self.scene = scene
         self.substeps = substeps
+        self.threads = threads
+        self.morphology: np.ndarray | None = None
         self.model = compile_model(scene, substeps)
         self._batch = Batch(self.model, nsim=batch, nthread=threads or cores())
         self._sensors = self._batch.bind("sensordata")  # refreshed by every call from here on
         self._joint = {name: self.model.joint(name).id for name in self._names()}
         self._bodies = [self.model.body(name).id for name in self._names()]  # the engine lists bodies depth first
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy is made of: it begins anew, with the same links, and has to be reset."""
+        return {
+            "arguments": (self.scene, self.batch, self.substeps, self.threads),
+            "morphology": self.morphology,
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(*state["arguments"])  # type: ignore[misc]
+        if state["morphology"] is not None:
+            self.resize(state["morphology"])
 
     def _names(self) -> list[str]:
         return [f"{body.name}/{link.name}" for body in self.scene.bodies for link in body.links]
@@ -121,10 +137,11 @@ class Truth:
         """Give the links of each simulation their lengths [m], radii [m] and masses [kg], (N, L, 3); then `reset`."""
         needed = (self.batch, len(self.scene.links), 3)
         if np.shape(morphology) != needed:
-            raise ValueError(f"morphology has shape {np.shape(morphology)}, but needs {needed}")
+            raise InputError(f"morphology has shape {np.shape(morphology)}, but needs {needed}")
         sizes, which = np.unique(np.asarray(morphology, float), axis=0, return_inverse=True)
         models = [compile_model(self.scene.sized(each), self.substeps) for each in sizes]
         self._batch.set_models([models[index] for index in which.ravel()])
+        self.morphology = np.asarray(morphology, float)
 
     @property
     def batch(self) -> int:

@@ -21,12 +21,13 @@ from scipy.stats import spearmanr
 
 from larp_model import evaluation
 from larp_model import weights as stored
+from larp_model.errors import InputError
 from larp_model.simulator import Simulator
 from larp_model.truth.episodes import Episodes
 from mpc import Dynamics, evaluate
 from mpc.search import coloured_noise
 from tasks.benchmarks import report
-from tasks.command import remember_compilations, run
+from tasks.command import prepare_jax, run
 from tasks.data import random_task
 from tasks.kick import Kick
 from tasks.models import WEIGHTS, Models, models_of
@@ -131,9 +132,9 @@ def main(
     """
     for name, value in (("targets", targets), ("candidates", candidates)):
         if value < 1:
-            raise ValueError(f"{name} is {value}, but must be at least 1")
+            raise InputError(f"{name} is {value}, but must be at least 1")
     report.ready(json, publish)
-    remember_compilations()
+    prepare_jax()
     kick = Kick.standard()
     models, truth = models_of(kick.scene, "larp", weights), models_of(kick.scene, "mujoco", weights)
     rows, episodes = candidates_of(kick, models, truth, targets, candidates, seed)

@@ -11,9 +11,10 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from larp_model.anatomy import Detail
+from larp_model.errors import InputError
 from larp_model.truth.mujoco import FINE_SUBSTEPS
 from tasks.benchmarks import report
-from tasks.command import remember_compilations, run
+from tasks.command import prepare_jax, run
 from tasks.data import random_roll, random_task
 from tasks.kick import USUAL, Kick
 from tasks.models import DynamicsName, Models, models_of
@@ -117,12 +118,12 @@ def main(
         publish: put the table into RESULTS.md.
     """
     if targets < 1:
-        raise ValueError(f"targets is {targets}, but must be at least 1")
+        raise InputError(f"targets is {targets}, but must be at least 1")
     chosen = preset_of(preset)
     if bodies == "varied" and (height != HEIGHT or budget is not None):
-        raise ValueError("bodies is 'varied', but height and budget are those of one body")
+        raise InputError("bodies is 'varied', but height and budget are those of one body")
     if not (np.isfinite(rolling) and rolling >= 0.0):
-        raise ValueError(f"rolling is {rolling}, but must be a finite speed of at least 0 m/s")
+        raise InputError(f"rolling is {rolling}, but must be a finite speed of at least 0 m/s")
     variant = {
         "reference": reference.stem if reference else "",
         "height": f"{height:g}" if height != HEIGHT else "",
@@ -138,7 +139,7 @@ def main(
     name = "_".join(["kick", preset, dynamics, *(f"{option}_{value}" for option, value in said.items())])
     json = json or Path(f"runs/benchmarks/{name}.json")
     report.ready(json, publish)
-    remember_compilations()
+    prepare_jax()
 
     def planned(kick: Kick) -> tuple[Kick, Models, Planners]:
         models = models_of(kick.scene, dynamics, weights or kick.weights)

@@ -16,13 +16,14 @@ from rich.table import Table
 from larp_model import evaluation
 from larp_model import weights as stored
 from larp_model.designs import DesignName
+from larp_model.errors import InputError
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from larp_model.truth import episodes as truth_episodes
 from larp_model.truth.bullet import BulletTruth
 from larp_model.truth.episodes import Episodes
 from tasks.benchmarks import report
-from tasks.command import remember_compilations, run
+from tasks.command import prepare_jax, run
 from tasks.models import WEIGHTS
 from tasks.scenarios import Scenario, around, scenario, trained_at
 
@@ -53,7 +54,7 @@ def weights_of(name: str, weights: Path | None) -> Path:
     """The manifest of a scene's weights: the one asked for, or the shipped one."""
     manifest = weights or stored.SHIPPED / f"{name}.json"
     if weights is None and not manifest.is_file():
-        raise ValueError(
+        raise InputError(
             f"weights of {name} are not shipped: train them with python -m tasks.train --scene {name}, and name their "
             "manifest with --weights"
         )
@@ -90,7 +91,7 @@ def main(
     """
     chosen = around(scenario(scene), reference, bodies == "varied")
     if sequences < 1:
-        raise ValueError(f"sequences is {sequences}, but must be at least 1")
+        raise InputError(f"sequences is {sequences}, but must be at least 1")
     manifest = weights_of(scene, weights)
     what = [
         scene,
@@ -100,10 +101,10 @@ def main(
     name = "_".join(["model", *what]).replace(" ", "_")
     json = json or Path(f"runs/benchmarks/{name}.json")
     report.ready(json, publish)
-    remember_compilations()
+    prepare_jax()
     other = trained_at(scene, beside) / "weights" / f"{scene}.json"
     if beside and not other.is_file():
-        raise ValueError(
+        raise InputError(
             f"beside is {beside}, but {other} is not there: `python -m tasks.train --scene {scene} --design {beside}`"
         )
     episodes = chosen.draw(sequences, seed)[0] if states is None else truth_episodes.load(states, chosen.scene)

@@ -8,10 +8,11 @@ from pathlib import Path
 from rich.table import Table
 
 from larp_model import weights as stored
+from larp_model.errors import InputError
 from mpc import CEM, MPPI, GaussNewton, Gradient
 from tasks.benchmarks import report
 from tasks.benchmarks.tradeoff import Point, measure
-from tasks.command import remember_compilations, run
+from tasks.command import prepare_jax, run
 from tasks.kick import USUAL, Kick
 from tasks.models import WEIGHTS, models_of
 from tasks.presets import Preset, Stage
@@ -72,9 +73,9 @@ def main(
         publish: put the table into RESULTS.md.
     """
     if targets < 1:
-        raise ValueError(f"targets is {targets}, but must be at least 1")
+        raise InputError(f"targets is {targets}, but must be at least 1")
     report.ready(json, publish)
-    remember_compilations()
+    prepare_jax()
     kick = Kick.standard()
     command = f"python -m tasks.benchmarks.optimizers --seconds {seconds:g} --targets {targets} --seed {seed}"
     rows = report.collect(

@@ -27,9 +27,10 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
+from larp_model.errors import InputError
 from mpc.loop import Execution
 from tasks.benchmarks import report
-from tasks.command import remember_compilations, run
+from tasks.command import prepare_jax, run
 from tasks.data import random_task
 from tasks.kick import USUAL, Kick, wished
 from tasks.live import Choices, Live, due, weights_for
@@ -148,9 +149,9 @@ def main(
         publish: update RESULTS.md.
     """
     if min(kicks, alone, clients) < 1:
-        raise ValueError(f"kicks, alone and clients are {kicks}, {alone} and {clients}, but must be at least 1")
+        raise InputError(f"kicks, alone and clients are {kicks}, {alone} and {clients}, but must be at least 1")
     report.ready(json, publish)
-    remember_compilations()
+    prepare_jax()
     random = np.random.default_rng(seed)
     targets = [random_task(random)[0] for _ in range(kicks)]
     kick = Kick.standard()

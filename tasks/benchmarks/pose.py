@@ -14,10 +14,11 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from larp_model.bodies import human_and_ball
+from larp_model.errors import InputError
 from larp_model.names import require_file
 from mpc.gauss_newton import FACTORS
 from tasks.benchmarks import report
-from tasks.command import remember_compilations, run
+from tasks.command import prepare_jax, run
 from tasks.keypoints import aist as dances
 from tasks.keypoints import figure as figures
 from tasks.keypoints import filmed, lift, metrics, physical
@@ -117,11 +118,11 @@ def of_dance(folder: Path, sequence: str, camera: int, seconds: float) -> Film:
     begun = keypoints.cut(0, round(seconds * keypoints.rate) - 1)
     try:
         first, last = shown(begun)
-    except ValueError as error:
-        raise ValueError(f"sequences has {name!r}, whose {error}") from None
+    except InputError as error:
+        raise InputError(f"sequences has {name!r}, whose {error}") from None
     true = true[first : last + 1]
     if np.isnan(metrics.pelvis(true)).any(axis=(1, 2)).all():
-        raise ValueError(f"sequences has {name!r}, of which no frame has both hips")
+        raise InputError(f"sequences has {name!r}, of which no frame has both hips")
     return Film(name, begun.cut(first, last), lens, true)
 
 
@@ -133,7 +134,7 @@ def dances_of(folder: Path, names: Sequence[str], cameras: int, seconds: float) 
     there = sorted(dances.sequences(folder).keys() & {path.stem for path in (folder / "keypoints2d").glob("*.pkl")})
     names = names or [video for video in EASY if dances.seen_by(video)[0] in there] or there
     if not names:
-        raise ValueError(f"aist is {str(folder)!r}, but keypoints2d in it has no sequence that mapping.txt has")
+        raise InputError(f"aist is {str(folder)!r}, but keypoints2d in it has no sequence that mapping.txt has")
     films: dict[str, Callable[[], Film]] = {}
     for sequence, only in map(dances.seen_by, names):
         for camera in range(cameras) if only is None else (only,):
@@ -238,19 +239,19 @@ def main(
         publish: put the table into RESULTS.md.
     """
     if cameras < 1:
-        raise ValueError(f"cameras is {cameras}, but must be at least 1")
+        raise InputError(f"cameras is {cameras}, but must be at least 1")
     if aist is not None and cameras > dances.CAMERAS:
-        raise ValueError(f"cameras is {cameras}, but AIST++ has {dances.CAMERAS}")
+        raise InputError(f"cameras is {cameras}, but AIST++ has {dances.CAMERAS}")
     if not 0.4 <= seconds <= 60.0:
-        raise ValueError(f"seconds is {seconds:g}, but must be from 0.4 to 60")
+        raise InputError(f"seconds is {seconds:g}, but must be from 0.4 to 60")
     if not ways or len(set(ways)) != len(ways):
-        raise ValueError(f"ways are {', '.join(ways) or 'none'}, but must be some of {', '.join(WAYS)}, each once")
+        raise InputError(f"ways are {', '.join(ways) or 'none'}, but must be some of {', '.join(WAYS)}, each once")
     if "mujoco_timed" in ways and not {"larp", "mujoco"} <= set(ways[: ways.index("mujoco_timed")]):
-        raise ValueError("ways has mujoco_timed, but needs larp and mujoco before it, whose times it goes by")
+        raise InputError("ways has mujoco_timed, but needs larp and mujoco before it, whose times it goes by")
     if clips and aist is not None:
-        raise ValueError("clips and aist are both set, but films are made of one of them")
+        raise InputError("clips and aist are both set, but films are made of one of them")
     if sequences and aist is None:
-        raise ValueError(f"sequences has {sequences[0]!r}, but aist, the folder they are in, is not set")
+        raise InputError(f"sequences has {sequences[0]!r}, but aist, the folder they are in, is not set")
     for clip in clips:
         require_file("clips", clip)
     films: dict[str, Callable[[], Film]] = {
@@ -261,7 +262,7 @@ def main(
     if aist is not None:
         films = dances_of(aist, sequences, cameras, seconds)
     report.ready(json, publish)
-    remember_compilations()
+    prepare_jax()
     named = f" --clips {' '.join(clip.name for clip in clips)}" if clips else ""
     if aist is not None:
         named = f" --aist {aist.name}" + (f" --sequences {' '.join(sequences)}" if sequences else "")

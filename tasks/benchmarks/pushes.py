@@ -20,6 +20,7 @@ from larp_model import contact, kinematics
 from larp_model import state as packed
 from larp_model.bodies import ball, capsule, chain, human, kicking_links
 from larp_model.designs import LEAST, compact
+from larp_model.errors import InputError
 from larp_model.parts.part import initial_weights, measure
 from larp_model.scene import Pair, Scene
 from larp_model.simulator import Simulator
@@ -399,11 +400,11 @@ def precision(bench: Bench) -> list[Row]:
 
 
 def refusal(call: Callable[[], Any], words: str) -> tuple[str, bool]:
-    """What a call that must be refused says, and whether it is a ValueError with these words."""
+    """What a call that must be refused says, and whether it is an InputError with these words."""
     try:
         call()
     except Exception as error:
-        return f"{type(error).__name__}: {str(error).splitlines()[0][:90]}", isinstance(error, ValueError) and (
+        return f"{type(error).__name__}: {str(error).splitlines()[0][:90]}", isinstance(error, InputError) and (
             words in str(error)
         )
     return "not refused", False

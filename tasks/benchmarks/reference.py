@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
 from larp_model.bodies import human_and_ball
+from larp_model.errors import InputError
 from larp_model.scene import Body, Scene
 from tasks.benchmarks import report
 from tasks.command import run
@@ -155,9 +156,9 @@ def main(clips: Path | None = None, json: Path = Path("runs/benchmarks/reference
     """
     paths = sorted(clips.glob("*.bvh")) if clips else []
     if clips and not paths:
-        raise ValueError(f"clips is {str(clips)!r}, but must be a folder that holds .bvh files")
+        raise InputError(f"clips is {str(clips)!r}, but must be a folder that holds .bvh files")
     if publish and not clips:
-        raise ValueError("publish is set, but there are no clips to compare with: clips must be a folder of .bvh files")
+        raise InputError("publish is set, but there are no clips to compare with: clips must be a folder of .bvh files")
     report.ready(json, publish)
     scene = human_and_ball()
     kicks = [performed("embedded", scene, embedded(scene)), *(recorded(path, scene) for path in paths)]

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
+from larp_model.errors import InputError
 from larp_model.files import require_writable, write_whole, written_whole
 from larp_model.truth.mujoco import cores
 
@@ -32,7 +33,7 @@ def ready(path: Path, publish: bool) -> None:
     """Refuses, before anything is computed, a JSON that could not be written or results that have no place."""
     require_writable(path.parent, "json")
     if publish and not RESULTS.is_file():
-        raise ValueError(f"publish is set, but {RESULTS} is not in this folder: run it where the project lies")
+        raise InputError(f"publish is set, but {RESULTS} is not in this folder: run it where the project lies")
 
 
 def collect(path: Path, command: str, jobs: Mapping[str, Callable[[], Row]]) -> list[Row]:

@@ -23,10 +23,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from rich.table import Table
 
+from larp_model.errors import InputError
 from larp_model.truth.mujoco import SUBSTEPS as CONVERGED
 from tasks.benchmarks import replays, report
 from tasks.benchmarks.engines import NAMES, PIPELINES, WEIGHTS, Question, case, titled
-from tasks.command import remember_compilations, run
+from tasks.command import prepare_jax, run
 from tasks.data import random_task
 from tasks.kick import Kick
 from tasks.models import models_of
@@ -59,7 +60,7 @@ def listed(name: str, text: str, known: tuple[str, ...]) -> list[str]:
     """The words between the commas; refuses what is not known."""
     words = [word.strip() for word in text.split(",")]
     if odd := [word for word in words if word not in known]:
-        raise ValueError(f"{name} has {odd[0]!r}, but can have {', '.join(known)}, with commas between them")
+        raise InputError(f"{name} has {odd[0]!r}, but can have {', '.join(known)}, with commas between them")
     return words
 
 
@@ -67,7 +68,7 @@ def batches(text: str) -> list[int]:
     """Batch sizes between commas, smallest first."""
     words = text.split(",")
     if not all(word.strip().isdecimal() and int(word) > 0 for word in words):
-        raise ValueError(f"batch is {text!r}, but must be integers of at least 1, with commas between them")
+        raise InputError(f"batch is {text!r}, but must be integers of at least 1, with commas between them")
     return sorted({int(word) for word in words})
 
 
@@ -327,9 +328,9 @@ def main(
     asked, tried = listed("scenes", scenes, tuple(CASES)), listed("engines", engines, tuple(SUBSTEPS))
     sizes = batches(batch)
     if kicks < 0:
-        raise ValueError(f"kicks is {kicks}, but must be at least 0")
+        raise InputError(f"kicks is {kicks}, but must be at least 0")
     report.ready(json, publish)
-    remember_compilations()
+    prepare_jax()
     again = replayed_by(tried) if kicks and "human_ball" in asked else []
     ask = Asking()
     each = [*questions(asked, tried, sizes, seed), *(price(*engine, seed) for engine in again)]

@@ -18,13 +18,14 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from larp_model import weights as stored
+from larp_model.errors import InputError
 from larp_model.truth.mujoco import Truth
 from mpc import CEM, MPPI, CostTerm, GaussNewton, Gradient, Planner
 from mpc.loop import Phase, Window, execute
 from tasks.benchmarks import pushes, report, slopes
 from tasks.benchmarks.pushes import Bench, refusal, row
 from tasks.benchmarks.report import Row
-from tasks.command import remember_compilations, run
+from tasks.command import prepare_jax, run
 from tasks.kick import Kick, miss
 from tasks.models import WEIGHTS, models_of
 from tasks.task import REACHABLE, checked_target
@@ -262,11 +263,11 @@ def main(
     """
     kinds = len(pushes.KINDS)
     if scenes < kinds:
-        raise ValueError(f"scenes is {scenes}, but must be at least {kinds}, one of each kind")
+        raise InputError(f"scenes is {scenes}, but must be at least {kinds}, one of each kind")
     if states < 32:
-        raise ValueError(f"states is {states}, but must be at least 32")
+        raise InputError(f"states is {states}, but must be at least 32")
     report.ready(json, publish)
-    remember_compilations()
+    prepare_jax()
     kick = Kick.standard()
     whole = models_of(kick.scene, "larp", weights).whole
     bench = Bench(kick, whole.dynamics)  # type: ignore[attr-defined]

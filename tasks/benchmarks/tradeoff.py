@@ -14,10 +14,11 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from larp_model import weights as stored
+from larp_model.errors import InputError
 from larp_model.truth.mujoco import SUBSTEPS
 from mpc import CEM, MPPI, GaussNewton, Gradient, Optimizer, Unless
 from tasks.benchmarks import report
-from tasks.command import remember_compilations, run
+from tasks.command import prepare_jax, run
 from tasks.data import random_task
 from tasks.kick import Kick
 from tasks.models import FLIGHT, WEIGHTS, models_of
@@ -81,7 +82,7 @@ def _told(stage: Sequence[Optimizer]) -> str:
                 return f"GN {each.directions}x{each.rounds} {slopes}"
             case Unless():
                 return f"if astray {_told(each.optimizers)}"
-        raise ValueError(f"optimizer is {each}, but must be one that has a name here")
+        raise InputError(f"optimizer is {each}, but must be one that has a name here")
 
     return " + ".join(map(one, stage)) or "nothing"
 
@@ -267,9 +268,9 @@ def main(
         publish: put the table into RESULTS.md and the picture into docs/.
     """
     if targets < 1:
-        raise ValueError(f"targets is {targets}, but must be at least 1")
+        raise InputError(f"targets is {targets}, but must be at least 1")
     report.ready(json, publish)
-    remember_compilations()
+    prepare_jax()
     kick = Kick.standard()
     command = f"python -m tasks.benchmarks.tradeoff --targets {targets} --seed {seed}"
     jobs = {point.name: partial(measure, kick, point, weights, targets, seed) for point in points()}

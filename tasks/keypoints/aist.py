@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from larp_model.errors import InputError
 from larp_model.names import meant, require_file
 from tasks.keypoints import arrays
 from tasks.keypoints.camera import Camera
@@ -53,11 +54,11 @@ def sequences(folder: Path) -> dict[str, str]:
     """The setting of the cameras by the name of each sequence, those left out that AIST++ itself found faulty."""
     mapping, ignored = folder / "cameras" / "mapping.txt", folder / "ignore_list.txt"
     if not folder.is_dir():
-        raise ValueError(f"aist is {str(folder)!r}, but must be the folder of AIST++'s annotations")
+        raise InputError(f"aist is {str(folder)!r}, but must be the folder of AIST++'s annotations")
     require_file("aist", mapping)
     rows = [line.split() for line in mapping.read_text(encoding="utf-8").splitlines() if line.strip()]
     if not rows or any(len(row) != 2 for row in rows):
-        raise ValueError("aist: mapping.txt needs a sequence and its setting in every line")
+        raise InputError("aist: mapping.txt needs a sequence and its setting in every line")
     faulty = set(ignored.read_text(encoding="utf-8").split()) if ignored.is_file() else set()
     return {sequence: setting for sequence, setting in rows if sequence not in faulty}
 
@@ -74,30 +75,30 @@ def video(sequence: str, camera: int) -> str:
 
 
 def load(folder: Path, sequence: str, camera: int) -> Dance:
-    """What one camera, from 0, saw of a sequence; ValueError, in one line, says what is missing or damaged.
+    """What one camera, from 0, saw of a sequence; InputError, in one line, says what is missing or damaged.
 
     Distortion is taken out of the keypoints, so that the camera has none; so is a focal length that differs across.
     """
     settings = sequences(folder)
     if sequence not in settings:
-        raise ValueError(
+        raise InputError(
             f"sequences has {sequence!r}, but mapping.txt in aist has no such sequence, or ignore_list.txt has it too"
             f"{meant(sequence, settings)}"
         )
     if camera not in range(CAMERAS):
-        raise ValueError(f"camera is {camera}, but must be from 0 to below {CAMERAS}")
+        raise InputError(f"camera is {camera}, but must be from 0 to below {CAMERAS}")
     if UNUSABLE.get(sequence) == camera:
-        raise ValueError(f"sequences has {video(sequence, camera)!r}, a camera that AIST++ leaves out itself")
+        raise InputError(f"sequences has {video(sequence, camera)!r}, a camera that AIST++ leaves out itself")
     seen = _array(folder / "keypoints2d" / f"{sequence}.pkl", "keypoints2d", (CAMERAS, None, _COUNT, 3))[camera]
     true = _array(folder / "keypoints3d" / f"{sequence}.pkl", "keypoints3d_optim", (None, _COUNT, 3))
     if len(seen) != len(true):
-        raise ValueError(f"aist: {sequence} has {len(seen)} frames in keypoints2d and {len(true)} in keypoints3d")
+        raise InputError(f"aist: {sequence} has {len(seen)} frames in keypoints2d and {len(true)} in keypoints3d")
 
     points = np.full((len(true), len(POINTS), 3), np.nan)
     points[:, _KNOWN] = 0.01 * true[:, _THEIRS] @ TURN.T
     lowest = points[:, _ANKLES, 2].min(axis=1)
     if np.isnan(lowest).all():
-        raise ValueError(f"aist: {sequence}.pkl has no frame in keypoints3d_optim with both ankles")
+        raise InputError(f"aist: {sequence}.pkl has no frame in keypoints3d_optim with both ankles")
     ground = np.array([0.0, 0.0, float(np.nanpercentile(lowest, ASTRAY)) - ANKLE])
 
     held = _camera(folder / "cameras" / f"{settings[sequence]}.json", camera)
@@ -142,9 +143,9 @@ def _camera(path: Path, which: int) -> dict[str, np.ndarray]:
     try:
         cameras = json.loads(path.read_bytes())
     except (ValueError, RecursionError):
-        raise ValueError(f"aist: {path.name} is no JSON file") from None
+        raise InputError(f"aist: {path.name} is no JSON file") from None
     if not isinstance(cameras, list) or len(cameras) != CAMERAS or not isinstance(cameras[which], dict):
-        raise ValueError(f"aist: {path.name} needs a list of {CAMERAS} cameras")
+        raise InputError(f"aist: {path.name} needs a list of {CAMERAS} cameras")
     held = {}
     for field, shape in FIELDS.items():
         try:
@@ -153,9 +154,9 @@ def _camera(path: Path, which: int) -> dict[str, np.ndarray]:
             held[field] = np.array(np.nan)
         if held[field].shape != shape or not np.isfinite(held[field]).all():
             needed = " x ".join(map(str, shape))
-            raise ValueError(f"aist: {path.name}, camera {which}: {field} needs {needed} finite numbers")
+            raise InputError(f"aist: {path.name}, camera {which}: {field} needs {needed} finite numbers")
     if not ((held["size"] > 0.0).all() and (held["matrix"][[0, 1], [0, 1]] > 0.0).all()):
-        raise ValueError(f"aist: {path.name}, camera {which}: size and the matrix' focal lengths must be above 0")
+        raise InputError(f"aist: {path.name}, camera {which}: size and the matrix' focal lengths must be above 0")
     return held
 
 
@@ -165,11 +166,11 @@ def _array(path: Path, name: str, shape: tuple[int | None, ...]) -> np.ndarray:
     found = held.get(name) if isinstance(held, dict) else None
     needs = ", ".join("T" if length is None else str(length) for length in shape)
     if not isinstance(found, np.ndarray) or found.dtype.kind != "f":
-        raise ValueError(f"aist: {path.name} needs {name}, floats ({needs})")
+        raise InputError(f"aist: {path.name} needs {name}, floats ({needs})")
     if found.ndim != len(shape) or not all(
         wanted in (None, own) for wanted, own in zip(shape, found.shape, strict=True)
     ):
-        raise ValueError(f"aist: {path.name} has {name} {found.shape}, but needs ({needs})")
+        raise InputError(f"aist: {path.name} has {name} {found.shape}, but needs ({needs})")
     if np.isinf(found).any():
-        raise ValueError(f"aist: {path.name} has {name} with numbers that are infinite")
+        raise InputError(f"aist: {path.name} has {name} with numbers that are infinite")
     return found.astype(float)

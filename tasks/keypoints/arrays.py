@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from larp_model.errors import InputError
+
 _CORES = ("numpy.core", "numpy._core")
 # Of what a file may name, each by its name here.
 NAMES = {
@@ -47,13 +49,13 @@ class _Unfinished:
 
 
 def load(path: Path) -> Any:
-    """What a pickle of protocol 2 to 5 holds; ValueError, in one line, if it is damaged or holds anything else."""
+    """What a pickle of protocol 2 to 5 holds; InputError, in one line, if it is damaged or holds anything else."""
     try:
         with warnings.catch_warnings(action="ignore"):  # of odd text in damaged files
             return _followed(path.read_bytes())
     except (ValueError, TypeError, LookupError, OverflowError, MemoryError) as error:
         why = shorten(str(error), 120, placeholder=" ...")
-        raise ValueError(f"{path.name} is no whole pickle of plain arrays: {why}; nothing in it was run") from None
+        raise InputError(f"{path.name} is no whole pickle of plain arrays: {why}; nothing in it was run") from None
 
 
 def _followed(content: bytes) -> Any:
@@ -101,7 +103,7 @@ def _followed(content: bytes) -> Any:
                 stack[-2:] = [_finished(unfinished, state)]
                 memo = {key: stack[-1] if held is unfinished else held for key, held in memo.items()}
             case name if name not in ("PROTO", "FRAME", "STOP"):
-                raise ValueError(f"it has the step {name}")
+                raise InputError(f"it has the step {name}")
     (found,) = stack
     return found
 
@@ -112,12 +114,12 @@ def _fill(held: Any, items: list[Any]) -> None:
     elif isinstance(held, dict) and all(type(key) in (str, int, bytes) for key in items[::2]):
         held.update(zip(items[::2], items[1::2], strict=True))
     else:
-        raise ValueError("it fills what is no list, and no dict by text or numbers")
+        raise InputError("it fills what is no list, and no dict by text or numbers")
 
 
 def _named(name: str) -> _Name:
     if name not in NAMES:
-        raise ValueError(f"it names {name.replace(' ', '.')!r}")
+        raise InputError(f"it names {name.replace(' ', '.')!r}")
     return _Name(NAMES[name])
 
 
@@ -127,7 +129,7 @@ def _made(name: Any, arguments: Any) -> Any:
             return _Unfinished()
         case _Name("type"), (str(code), _, _):
             if not _TYPES.fullmatch(code):
-                raise ValueError(f"it has an array of type {code!r}")
+                raise InputError(f"it has an array of type {code!r}")
             return _Unfinished(np.dtype(code))
         case _Name("bytes"), ():
             return b""
@@ -135,7 +137,7 @@ def _made(name: Any, arguments: Any) -> Any:
             return text.encode("latin1")
         case _Name("filled"), (raw, kind, shape, order):
             return _array(raw, kind, shape, order)
-    raise ValueError("it makes something that is not known")
+    raise InputError("it makes something that is not known")
 
 
 def _finished(unfinished: Any, state: Any) -> Any:
@@ -144,13 +146,13 @@ def _finished(unfinished: Any, state: Any) -> Any:
             return _array(raw, kind, shape, "F" if by_column else "C")
         case _Unfinished(kind=np.dtype() as kind), (_, "<" | ">" | "|" as order, None, None, None, *_):
             return kind.newbyteorder(order)
-    raise ValueError("it has an array of no plain kind")
+    raise InputError("it has an array of no plain kind")
 
 
 def _array(raw: Any, kind: Any, shape: Any, order: Any) -> np.ndarray:
     if not isinstance(raw, bytes | bytearray) or not isinstance(kind, np.dtype):
-        raise ValueError("it has an array without bytes or type")
+        raise InputError("it has an array without bytes or type")
     array = np.ndarray(shape, kind, buffer=bytes(raw), order=order)
     if array.nbytes != len(raw):
-        raise ValueError(f"it has an array {shape} of {kind} in {len(raw)} bytes")
+        raise InputError(f"it has an array {shape} of {kind} in {len(raw)} bytes")
     return array.copy(order="K")

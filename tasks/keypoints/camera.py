@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from larp_model.errors import InputError
 from larp_model.names import require_file, require_known
 
 # Horizontal field of view of a phone's camera that nobody has described [degrees], and the height it is held at [m].
@@ -50,7 +51,7 @@ def looking(position: np.ndarray, at: np.ndarray, focal: float, size: tuple[floa
     ahead /= np.linalg.norm(ahead)
     right = np.cross(ahead, (0.0, 0.0, 1.0))
     if np.linalg.norm(right) < 1e-3:
-        raise ValueError(f"look_at is {list(at)}, straight above or below the camera: which way is up is not known")
+        raise InputError(f"look_at is {list(at)}, straight above or below the camera: which way is up is not known")
     right /= np.linalg.norm(right)
     return Camera(
         focal, 0.5 * np.asarray(size, float), np.stack([right, np.cross(ahead, right), ahead]), np.asarray(position)
@@ -60,7 +61,7 @@ def looking(position: np.ndarray, at: np.ndarray, focal: float, size: tuple[floa
 def focal_length(field_of_view: float, width: float) -> float:
     """In pixels, of a camera with a horizontal field of view [degrees] and images so wide [px]."""
     if not 10.0 <= field_of_view <= 150.0:
-        raise ValueError(f"field_of_view is {field_of_view:g}, but must be from 10 to 150 degrees")
+        raise InputError(f"field_of_view is {field_of_view:g}, but must be from 10 to 150 degrees")
     return 0.5 * width / math.tan(math.radians(0.5 * field_of_view))
 
 
@@ -82,9 +83,9 @@ def load(path: str | Path, size: tuple[float, float] | None = None) -> tuple[Cam
     try:
         given = json.loads(path.read_bytes())
     except ValueError:
-        raise ValueError(f"camera: {path.name} is no JSON file") from None
+        raise InputError(f"camera: {path.name} is no JSON file") from None
     if not isinstance(given, dict):
-        raise ValueError(f"camera: {path.name} needs an object with some of {', '.join(FIELDS)}")
+        raise InputError(f"camera: {path.name} needs an object with some of {', '.join(FIELDS)}")
     for name in given:
         require_known(f"camera: a field of {path.name}", name, FIELDS)
 
@@ -93,31 +94,31 @@ def load(path: str | Path, size: tuple[float, float] | None = None) -> tuple[Cam
         listed = value if isinstance(value, list) else [value]
         good = all(isinstance(each, int | float) and math.isfinite(each) for each in listed)
         if not good or len(listed) != count or isinstance(value, list) != (count > 1):
-            raise ValueError(f"camera: {name} is {value!r}, but needs {count} finite number{'s' if count > 1 else ''}")
+            raise InputError(f"camera: {name} is {value!r}, but needs {count} finite number{'s' if count > 1 else ''}")
         return np.array(listed, float)
 
     if "size" in given:
         width, height = numbers("size", 2)
         size = width, height
     if size is None:
-        raise ValueError(f"camera: {path.name} has no size, but needs the images' [width, height]")
+        raise InputError(f"camera: {path.name} has no size, but needs the images' [width, height]")
     if not min(size) > 0.0:
-        raise ValueError(f"camera: size is {list(size)}, but needs numbers above 0")
+        raise InputError(f"camera: size is {list(size)}, but needs numbers above 0")
     if "focal" in given and "field_of_view" in given:
-        raise ValueError(f"camera: {path.name} has both focal and field_of_view, but needs one of them")
+        raise InputError(f"camera: {path.name} has both focal and field_of_view, but needs one of them")
     if "focal" in given:
         (focal,) = numbers("focal", 1)
         if not focal > 0.0:
-            raise ValueError(f"camera: focal is {focal:g}, but must be above 0")
+            raise InputError(f"camera: focal is {focal:g}, but must be above 0")
     else:
         (angle,) = numbers("field_of_view", 1) if "field_of_view" in given else (FIELD_OF_VIEW,)
         focal = focal_length(angle, size[0])
     if ("position" in given) != ("look_at" in given):
-        raise ValueError(f"camera: {path.name} has one of position and look_at, but needs both or neither")
+        raise InputError(f"camera: {path.name} has one of position and look_at, but needs both or neither")
     if "position" in given:
         position, at = numbers("position", 3), numbers("look_at", 3)
         if not position[2] > 0.0:
-            raise ValueError(f"camera: position is {position.tolist()}, but must be above the ground, z = 0")
+            raise InputError(f"camera: position is {position.tolist()}, but must be above the ground, z = 0")
         found = looking(position, at, focal, size)
     else:
         found = held(focal, size)

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from larp_model.errors import InputError
 from larp_model.names import require_file, require_known
 from tasks.keypoints.points import POINTS, RATES, SIDES, Keypoints
 
@@ -89,7 +90,7 @@ _Track = dict[int, _Detection]  # one person's, by frame, in the order of the fr
 def load(
     path: str | Path, rate: float | None = None, size: tuple[float, float] | None = None, person: int | None = None
 ) -> Loaded:
-    """Read one person's points; ValueError, in one line, says what is missing, damaged or not understood.
+    """Read one person's points; InputError, in one line, says what is missing, damaged or not understood.
 
     path: a file, or a folder with one for each frame. rate: frames a second. size: width and height of the images [px].
     Only npz files hold these two, and the arguments win. person: which one, from 0 in order of appearance; by default
@@ -106,23 +107,23 @@ def load(
     try:
         film = _read(path, size)
         frames = _in_order(film.frames)
-    except ValueError as error:
-        raise ValueError(f"{name} {error}") from None
+    except InputError as error:
+        raise InputError(f"{name} {error}") from None
     rate = film.rate if rate is None else rate
     if rate is None:
-        raise ValueError(f"rate is not known, {name} does not hold it: give frames a second")
+        raise InputError(f"rate is not known, {name} does not hold it: give frames a second")
     if not RATES[0] <= rate <= RATES[1]:
-        raise ValueError(f"rate is {rate:g}, but must be from {RATES[0]:g} to {RATES[1]:g} frames a second")
+        raise InputError(f"rate is {rate:g}, but must be from {RATES[0]:g} to {RATES[1]:g} frames a second")
     tracks = _tracks(frames, rate)
     if person is not None and person not in range(len(tracks)):
-        raise ValueError(f"person is {person}, but must be from 0 to below {len(tracks)}, the people in {name}")
+        raise InputError(f"person is {person}, but must be from 0 to below {len(tracks)}, the people in {name}")
     track = max(tracks, key=_prominence) if person is None else tracks[person]
     points = np.full((len(frames), len(POINTS), 3), (np.nan, np.nan, 0.0))
     points[list(track)] = [one.points for one in track.values()]
     seen = np.flatnonzero(points[..., 2].any(axis=0))
     if len(seen) < _FEWEST_POINTS:
         only = ", ".join(POINTS[point] for point in seen)
-        raise ValueError(f"{name} has only {only} of this person, but needs {_FEWEST_POINTS} points or more")
+        raise InputError(f"{name} has only {only} of this person, but needs {_FEWEST_POINTS} points or more")
     keypoints = Keypoints(points[..., :2], points[..., 2], float(rate), size or film.size)
     return Loaded(keypoints, len(tracks), sum(_crossed(one, frames[frame]) for frame, one in track.items()))
 
@@ -138,14 +139,14 @@ def _read(path: Path, size: tuple[float, float] | None) -> _Film:
 def _in_order(frames: Mapping[int, list[_Detection]]) -> list[list[_Detection]]:
     """All frames from the first number to the last, missing ones empty; people of whom nothing was found left out."""
     if not frames:
-        raise ValueError("has no frames")
+        raise InputError("has no frames")
     first, last = min(frames), max(frames)
     if last - first >= _MOST_FRAMES:
-        raise ValueError(f"has frames from {first} to {last}, but may have {_MOST_FRAMES} at most")
+        raise InputError(f"has frames from {first} to {last}, but may have {_MOST_FRAMES} at most")
     numbers = range(first, last + 1)
     found = [[one for one in frames.get(number, []) if one.points[:, 2].any()] for number in numbers]
     if not any(found):
-        raise ValueError("has no person in any frame")
+        raise InputError("has no person in any frame")
     return found
 
 
@@ -158,9 +159,9 @@ def _folder(path: Path) -> dict[int, list[_Detection]]:
                 case {"people": people} | [*people]:
                     frames[number] = _people(people)
                 case _:
-                    raise ValueError("has no list of people")
-        except ValueError as error:
-            raise ValueError(f"has {name}, which {error}") from None
+                    raise InputError("has no list of people")
+        except InputError as error:
+            raise InputError(f"has {name}, which {error}") from None
     return frames
 
 
@@ -170,9 +171,9 @@ def _numbered(labels: Iterable[object]) -> dict[int, object]:
     for label in labels:
         numbers = re.findall(r"\d+", Path(str(label)).stem)
         if not numbers:
-            raise ValueError(f"has {_short(label)} as a frame, but needs the frame's number in the name")
+            raise InputError(f"has {_short(label)} as a frame, but needs the frame's number in the name")
         if int(numbers[-1]) in numbered:
-            raise ValueError(f"has two frames with number {int(numbers[-1])}, but needs the frames of one film")
+            raise InputError(f"has two frames with number {int(numbers[-1])}, but needs the frames of one film")
         numbered[int(numbers[-1])] = label
     return numbered
 
@@ -181,7 +182,7 @@ def _parsed(path: Path) -> object:
     try:
         return json.loads(path.read_bytes())
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"is not whole as JSON ({error}); {_UNDERSTOOD}") from None
+        raise InputError(f"is not whole as JSON ({error}); {_UNDERSTOOD}") from None
 
 
 def _frames(content: object, size: tuple[float, float] | None) -> dict[int, list[_Detection]]:
@@ -199,12 +200,12 @@ def _frames(content: object, size: tuple[float, float] | None) -> dict[int, list
                     return {number: _of_mediapipe(entry, size) for number, entry in enumerate(entries)}
                 case [] | [{"keypoints": _}, *_]:
                     return {number: _people(entry) for number, entry in enumerate(entries)}
-    raise ValueError(f"is JSON of another kind; {_UNDERSTOOD}")
+    raise InputError(f"is JSON of another kind; {_UNDERSTOOD}")
 
 
 def _of_alphapose(entries: list) -> dict[int, list[_Detection]]:
     if not all(isinstance(entry, dict) and "image_id" in entry for entry in entries):
-        raise ValueError("has an entry without image_id")
+        raise InputError("has an entry without image_id")
     people: dict[object, list] = {}
     for entry in entries:
         people.setdefault(str(entry["image_id"]), []).append(entry)
@@ -213,7 +214,7 @@ def _of_alphapose(entries: list) -> dict[int, list[_Detection]]:
 
 def _of_mmpose(entries: list, names: tuple[str, ...] | None = None) -> dict[int, list[_Detection]]:
     if not all(isinstance(entry, dict) and {"frame_id", "instances"} <= entry.keys() for entry in entries):
-        raise ValueError("has an entry without frame_id and instances")
+        raise InputError("has an entry without frame_id and instances")
     numbers = _numbered(entry["frame_id"] for entry in entries)
     return {number: _people(entry["instances"], names) for number, entry in zip(numbers, entries, strict=True)}
 
@@ -224,7 +225,7 @@ def _called(meta: object) -> tuple[str, ...] | None:
         case {"keypoint_id2name": {**table}}:
             order = [str(number) for number in range(len(table))]
             if set(order) != set(table):
-                raise ValueError("has keypoint_id2name, but needs a name there for each number from 0")
+                raise InputError("has keypoint_id2name, but needs a name there for each number from 0")
             return tuple(str(table[number]).replace("_big_toe", "_toe") for number in order)
     return None
 
@@ -237,15 +238,15 @@ def _people(entries: object, names: tuple[str, ...] | None = None) -> list[_Dete
             case {"keypoints": places, "keypoint_scores": scores}:
                 places, scores = _numbers("keypoints", places), _numbers("keypoint_scores", scores)
                 if scores.ndim != 1 or places.shape != (len(scores), 2):
-                    raise ValueError(f"has keypoints {places.shape}, but needs (P, 2), and keypoint_scores (P,)")
+                    raise InputError(f"has keypoints {places.shape}, but needs (P, 2), and keypoint_scores (P,)")
                 rows = np.column_stack([places, scores])
             case {"pose_keypoints_2d": numbers} | {"keypoints": numbers}:
                 rows = _numbers("keypoints", numbers)
                 if rows.size % 3:
-                    raise ValueError(f"has keypoints of {rows.size} numbers, but needs x, y and confidence of each")
+                    raise InputError(f"has keypoints of {rows.size} numbers, but needs x, y and confidence of each")
                 rows = rows.reshape(-1, 3)
             case _:
-                raise ValueError("has a person without keypoints")
+                raise InputError("has a person without keypoints")
         rows[(rows[:, :2] == 0.0).all(axis=1)] = 0.0
         identity = next((entry[key] for key in ("person_id", "idx", "track_id") if key in entry), None)
         found.append(_Detection(_ours(rows, names), _identity(identity)))
@@ -255,11 +256,11 @@ def _people(entries: object, names: tuple[str, ...] | None = None) -> list[_Dete
 def _of_mediapipe(frame: object, size: tuple[float, float] | None) -> list[_Detection]:
     landmarks = _list(frame.get("landmarks", frame) if isinstance(frame, dict) else frame)
     if size is None:
-        raise ValueError("has places as parts of the image: give size, its width and height in pixels")
+        raise InputError("has places as parts of the image: give size, its width and height in pixels")
     try:
         rows = [[landmark[key] for key in ("x", "y", "visibility")] for landmark in landmarks]
     except (KeyError, TypeError):
-        raise ValueError("has a landmark without x, y and visibility") from None
+        raise InputError("has a landmark without x, y and visibility") from None
     # One person, who may be lost for long.
     return [_Detection(_ours(_numbers("landmarks", rows) * (*size, 1.0)), 0.0)] if rows else []
 
@@ -270,27 +271,27 @@ def _npz(path: Path) -> _Film:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             held = dict(arrays)
     except Exception:  # Each part of an archive is damaged in its own way.
-        raise ValueError("is no whole npz file of numbers and names") from None
+        raise InputError("is no whole npz file of numbers and names") from None
     kind, columns = ("points", 3) if "points" in held else ("places", 2)
     if not {"names", kind} <= held.keys():
-        raise ValueError("is npz without names, and places or points")
+        raise InputError("is npz without names, and places or points")
     names = tuple(str(name) for name in held["names"].ravel())
     for name in names:
         require_known("has a name that", name, POINTS)
     if len(set(names)) < len(names):
-        raise ValueError("has a name twice")
+        raise InputError("has a name twice")
     rows = _numbers(kind, held[kind])
     if rows.ndim != 3 or rows.shape[1:] != (len(names), columns):
-        raise ValueError(f"has {kind} {rows.shape}, but needs (T, {len(names)}, {columns})")
+        raise InputError(f"has {kind} {rows.shape}, but needs (T, {len(names)}, {columns})")
     if kind == "places":
         confidence = _numbers("confidence", held.get("confidence", np.ones(rows.shape[:2])))
         if confidence.shape != rows.shape[:2]:
-            raise ValueError(f"has confidence {confidence.shape}, but needs {rows.shape[:2]}")
+            raise InputError(f"has confidence {confidence.shape}, but needs {rows.shape[:2]}")
         rows = np.dstack([rows, confidence])
     rows[np.isnan(rows[..., :2]).any(axis=-1)] = 0.0
     rate = _numbers("rate", held.get("rate", np.nan))
     if rate.shape:
-        raise ValueError(f"has a rate {rate.shape}, but needs one number")
+        raise InputError(f"has a rate {rate.shape}, but needs one number")
     return _Film(
         {number: [_Detection(_ours(frame, names), 0.0)] for number, frame in enumerate(rows)},
         float(rate) if "rate" in held else None,
@@ -301,7 +302,7 @@ def _npz(path: Path) -> _Film:
 def _size(value: object) -> tuple[float, float]:
     numbers = _numbers("size", value)
     if numbers.shape != (2,) or not ((numbers > 0.0) & (numbers < _LARGEST)).all():
-        raise ValueError(f"size is {_short(value)}, but must be a width and a height above 0, in pixels")
+        raise InputError(f"size is {_short(value)}, but must be a width and a height above 0, in pixels")
     return float(numbers[0]), float(numbers[1])
 
 
@@ -311,7 +312,7 @@ def _short(value: object) -> str:
 
 def _list(value: object) -> list:
     if not isinstance(value, list | None):
-        raise ValueError(f"has {_short(value)} where it needs a list")
+        raise InputError(f"has {_short(value)} where it needs a list")
     return value or []
 
 
@@ -319,16 +320,16 @@ def _numbers(what: str, value: object) -> np.ndarray:
     try:
         return np.array(value, float)
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"has {what} with something that is not a number") from None
+        raise InputError(f"has {what} with something that is not a number") from None
 
 
 def _ours(rows: np.ndarray, names: tuple[str, ...] | None = None) -> np.ndarray:
     """Places [px] and confidence of `POINTS` (P, 3), NaN and 0 where not found, from a detector's, by its names."""
     if len(rows) not in (ORDERS if names is None else {len(names)}):
         known = ", ".join(map(str, ORDERS)) if names is None else f"{len(names)}, as many as it names"
-        raise ValueError(f"has a person of {len(rows)} points, but needs {known}")
+        raise InputError(f"has a person of {len(rows)} points, but needs {known}")
     if not (abs(rows) < _LARGEST).all():
-        raise ValueError(f"has places or confidences that are not finite, or not below {_LARGEST:g}")
+        raise InputError(f"has places or confidences that are not finite, or not below {_LARGEST:g}")
     found = np.zeros((len(POINTS), 3))
     for row, name in enumerate(ORDERS[len(rows)] if names is None else names):
         if name in POINTS:

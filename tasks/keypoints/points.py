@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from larp_model.errors import InputError
+
 SIDES = ("left", "right")
 LIMBS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle", "heel", "toe")
 # What we know of a person, the sides being the person's own; the toe is the tip of the big one.
@@ -22,7 +24,7 @@ class Keypoints:
 
     places: (T, P, 2) [px], in the order of `POINTS`, x to the right and y down from the upper left corner; NaN where a
     point was not found. confidence: (T, P) from 0, not found, to 1. rate: frames a second. size: width and height of
-    the images [px], if they are known. ValueError where these do not fit together.
+    the images [px], if they are known. InputError where these do not fit together.
     """
 
     places: np.ndarray
@@ -33,16 +35,16 @@ class Keypoints:
     def __post_init__(self) -> None:
         frames = len(self.places)
         if self.places.shape != (frames, len(POINTS), 2) or self.confidence.shape != (frames, len(POINTS)):
-            raise ValueError(
+            raise InputError(
                 f"places and confidence have shapes {self.places.shape} and {self.confidence.shape}, but need "
                 f"(T, {len(POINTS)}, 2) and (T, {len(POINTS)})"
             )
         if not (RATES[0] <= self.rate <= RATES[1]):
-            raise ValueError(f"rate is {self.rate:g}, but must be from {RATES[0]:g} to {RATES[1]:g} frames a second")
+            raise InputError(f"rate is {self.rate:g}, but must be from {RATES[0]:g} to {RATES[1]:g} frames a second")
         if not ((self.confidence >= 0.0) & (self.confidence <= 1.0)).all():
-            raise ValueError("confidence holds numbers that are not from 0 to 1")
+            raise InputError("confidence holds numbers that are not from 0 to 1")
         if not np.isfinite(self.places[self.confidence > 0.0]).all():
-            raise ValueError("places holds numbers that are not finite, of points that were found")
+            raise InputError("places holds numbers that are not finite, of points that were found")
 
     def __len__(self) -> int:
         return len(self.places)

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from larp_model.bodies import human
+from larp_model.errors import InputError
 from larp_model.names import require_file
 from larp_model.scene import Body, Vector, anchor
 from tasks.motions.skeleton import LIMBS, SIDES, Motion
@@ -36,15 +37,15 @@ def load(path: str | Path) -> Motion:
         with np.load(path, allow_pickle=False) as file:
             given = dict(file)
     except (ValueError, OSError, EOFError, BadZipFile):
-        raise ValueError(f"{path.name} is no npz file of numbers and names") from None
+        raise InputError(f"{path.name} is no npz file of numbers and names") from None
     if missing := [name for name in FIELDS if name not in given]:
-        raise ValueError(f"{path.name} has no {', '.join(missing)}: it needs {', '.join(FIELDS)}")
+        raise InputError(f"{path.name} has no {', '.join(missing)}: it needs {', '.join(FIELDS)}")
     names = given.get("joints")
     joints = None if names is None else [str(name) for name in np.atleast_1d(names)]
     try:
         return motion(given["rate"], given["position"], given["orientation"], given["angles"], joints)
-    except ValueError as error:
-        raise ValueError(f"{path.name}: {error}") from None
+    except InputError as error:
+        raise InputError(f"{path.name}: {error}") from None
 
 
 def motion(
@@ -73,16 +74,16 @@ def motion(
     ):
         if value.shape != shape or not frames:
             wanted = {"rate": "()", "position": "(T, 3)", "orientation": "(T, 4)", "angles": f"(T, {count}, 3)"}[name]
-            raise ValueError(f"{name} has shape {value.shape}, but needs {wanted}, the same T in all")
+            raise InputError(f"{name} has shape {value.shape}, but needs {wanted}, the same T in all")
         if not np.isfinite(value).all():
-            raise ValueError(f"{name} holds numbers that are not finite")
+            raise InputError(f"{name} holds numbers that are not finite")
     if not RATES[0] <= rate <= RATES[1]:
-        raise ValueError(f"rate is {rate:g}, but must be from {RATES[0]:g} to {RATES[1]:g} frames a second")
+        raise InputError(f"rate is {rate:g}, but must be from {RATES[0]:g} to {RATES[1]:g} frames a second")
     if abs(np.linalg.norm(orientation, axis=-1) - 1.0).max() > 1e-3:
-        raise ValueError("orientation holds quaternions that are not of length 1")
+        raise InputError("orientation holds quaternions that are not of length 1")
     if joints is not None:
         if sorted(joints) != sorted(names):
-            raise ValueError(f"joints are {', '.join(joints)}, but must be {', '.join(names)}, in any order")
+            raise InputError(f"joints are {', '.join(joints)}, but must be {', '.join(names)}, in any order")
         angles = angles[:, [joints.index(name) for name in names]]
     return _of_links(body, float(rate), position, _link_rotations(body, orientation, angles))
 

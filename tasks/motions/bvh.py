@@ -19,6 +19,7 @@ from textwrap import shorten
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from larp_model.errors import InputError
 from larp_model.names import require_file
 from tasks.motions.rest_pose import resting
 from tasks.motions.skeleton import NEEDED, SIDES, Motion, bone, facing, is_t_pose
@@ -51,7 +52,7 @@ _PREFIX = re.compile(r"^(.*:|mixamorig\d*_)")  # of a whole skeleton, as in mixa
 
 
 def load(path: str | Path, names: Mapping[str, str] | None = None) -> Motion:
-    """Read a BVH file; ValueError, in one line, says what is missing, damaged or not understood.
+    """Read a BVH file; InputError, in one line, says what is missing, damaged or not understood.
 
     names: what the file calls the joints of `NEEDED`, {"Hips": "pelvis", ...}; those left out go by our names. By
     default, the table of `SKELETONS` that fits the file best. Prefixes, as in mixamorig:Hips, are left out. The rest
@@ -64,8 +65,8 @@ def load(path: str | Path, names: Mapping[str, str] | None = None) -> Motion:
     try:
         joints, duration, data = _parse(path.read_bytes().decode("ascii", "replace").splitlines())
         return _motion(_named(joints, tables), duration, data)
-    except ValueError as error:
-        raise ValueError(f"{path.name} {error}") from None
+    except InputError as error:
+        raise InputError(f"{path.name} {error}") from None
 
 
 def dumps(motion: Motion) -> str:
@@ -110,21 +111,21 @@ def names_in(path: Path) -> dict[str, str]:
     try:
         found = json.loads(path.read_bytes())
     except ValueError:
-        raise ValueError(f"names: {path.name} is no JSON file") from None
+        raise InputError(f"names: {path.name} is no JSON file") from None
     if not (isinstance(found, dict) and all(isinstance(each, str) for each in found.values())):
-        raise ValueError(f'names: {path.name} needs an object such as {{"Hips": "pelvis", "LeftLeg": "l_knee"}}')
+        raise InputError(f'names: {path.name} needs an object such as {{"Hips": "pelvis", "LeftLeg": "l_knee"}}')
     return found
 
 
 def _table(names: Mapping[str, str]) -> dict[str, str]:
-    """A user's table, made whole; ValueError where it names joints that are not ours, or one joint twice."""
+    """A user's table, made whole; InputError where it names joints that are not ours, or one joint twice."""
     if unknown := [str(name) for name in names if name not in NEEDED]:
-        raise ValueError(f"names has {', '.join(unknown)}, but needs a file's names of {', '.join(NEEDED)}")
+        raise InputError(f"names has {', '.join(unknown)}, but needs a file's names of {', '.join(NEEDED)}")
     table = {name: _PREFIX.sub("", names.get(name, name)) for name in NEEDED}
     if len(set(table.values())) < len(table):
         twice = next(theirs for theirs in table.values() if list(table.values()).count(theirs) > 1)
         ours = " and ".join(name for name, theirs in table.items() if theirs == twice)
-        raise ValueError(f"names has {twice!r} for {ours}, but needs another joint for each")
+        raise InputError(f"names has {twice!r} for {ours}, but needs another joint for each")
     return table
 
 
@@ -141,31 +142,31 @@ def _parse(lines: list[str]) -> tuple[list[_Joint], float, np.ndarray]:
     rows = [(number, line.split()) for number, line in enumerate(lines, start=1) if line.strip()]
     start = next((index for index, (_, words) in enumerate(rows) if words == ["MOTION"]), None)
     if start is None or rows[0][1] != ["HIERARCHY"]:
-        raise ValueError("is no BVH file: it needs a line HIERARCHY first and a line MOTION later")
+        raise InputError("is no BVH file: it needs a line HIERARCHY first and a line MOTION later")
     joints = _hierarchy(word for _, words in rows[1:start] for word in words)
     match [words for _, words in rows[start + 1 : start + 3]]:
         case [["Frames:", count], ["Frame", "Time:", seconds]] if count.isdecimal():
             (duration,) = _numbers([seconds], 1, "has a Frame Time that")
         case _:
-            raise ValueError("has no frames: it needs lines 'Frames: N' and 'Frame Time: SECONDS' after MOTION")
+            raise InputError("has no frames: it needs lines 'Frames: N' and 'Frame Time: SECONDS' after MOTION")
     if not 0.0 < duration <= 0.1:
-        raise ValueError(f"has a Frame Time of {duration:g} s, but needs one above 0 and up to 0.1 s")
+        raise InputError(f"has a Frame Time of {duration:g} s, but needs one above 0 and up to 0.1 s")
     columns = sum(len(joint.channels) for joint in joints)
     data = [_numbers(words, columns, f"has a line, {number}, that") for number, words in rows[start + 3 :]]
     if not data or len(data) != int(count):
-        raise ValueError(f"has {len(data) or 'no'} frames, but announces {count[:9]}")
+        raise InputError(f"has {len(data) or 'no'} frames, but announces {count[:9]}")
     return joints, duration, np.array(data)
 
 
 def _numbers(words: list[str], count: int, place: str) -> list[float]:
     if len(words) != count:
-        raise ValueError(f"{place} has {len(words)} columns, but needs {count}")
+        raise InputError(f"{place} has {len(words)} columns, but needs {count}")
     try:
         values = [float(word) for word in words]
     except ValueError:
-        raise ValueError(f"{place} holds something that is not a number") from None
+        raise InputError(f"{place} holds something that is not a number") from None
     if not all(abs(value) < _LARGEST for value in values):
-        raise ValueError(f"{place} holds a number that is not finite, or not below {_LARGEST:g}")
+        raise InputError(f"{place} holds a number that is not finite, or not below {_LARGEST:g}")
     return values
 
 
@@ -177,7 +178,7 @@ def _hierarchy(words: Iterator[str]) -> list[_Joint]:
     def need(*wanted: str) -> None:
         for word in wanted:
             if (found := next(words, "its end")) != word:
-                raise ValueError(f"has {found[:40]!r} in its HIERARCHY, but needs {word!r} there")
+                raise InputError(f"has {found[:40]!r} in its HIERARCHY, but needs {word!r} there")
 
     for word in words:
         if word == "}" and line:
@@ -196,14 +197,14 @@ def _hierarchy(words: Iterator[str]) -> list[_Joint]:
             wanted = [axis + kind for kind in kinds for axis in "XYZ"]
             channels = list(islice(words, len(wanted)))
             if count != str(len(wanted)) or sorted(channels) != sorted(wanted):
-                raise ValueError(f"has a joint, {name}, with other channels than {', '.join(wanted)}, each once")
+                raise InputError(f"has a joint, {name}, with other channels than {', '.join(wanted)}, each once")
             joints.append(_Joint(name, line[-1] if line else -1, offset, channels))
             line.append(len(joints) - 1)
         else:
-            raise ValueError(f"has {word[:40]!r} in its HIERARCHY, where it does not belong")
+            raise InputError(f"has {word[:40]!r} in its HIERARCHY, where it does not belong")
     names = [joint.name for joint in joints]
     if line or len(set(names)) != len(names):
-        raise ValueError("has a HIERARCHY with " + ("braces left open" if line else "two joints of one name"))
+        raise InputError("has a HIERARCHY with " + ("braces left open" if line else "two joints of one name"))
     return joints
 
 
@@ -212,7 +213,7 @@ def _named(joints: list[_Joint], tables: list[dict[str, str]]) -> list[_Joint]:
     found = [joint.name for joint in joints]
     table = min(tables, key=lambda table: len(set(table.values()) - set(found)))
     if missing := {ours: theirs for ours, theirs in table.items() if theirs not in found}:
-        raise ValueError(
+        raise InputError(
             f"has no joints {', '.join(missing.values())}, but needs them, or names that say what it calls"
             f" {', '.join(missing)}: it has {shorten(', '.join(found), 600)}"
         )
@@ -232,16 +233,16 @@ def _motion(joints: list[_Joint], duration: float, data: np.ndarray) -> Motion:
     legs = float(np.linalg.norm(thighs, axis=-1).mean() + np.linalg.norm(shins, axis=-1).mean())
     unit = next((unit for unit in UNITS if LEG_LENGTH[0] <= unit * legs <= LEG_LENGTH[1]), None)
     if unit is None:
-        raise ValueError(f"has legs {legs:.3g} units long, but needs 0.6 to 1.2 m in units of 0.0254/0.45 m, cm or m")
+        raise InputError(f"has legs {legs:.3g} units long, but needs 0.6 to 1.2 m in units of 0.0254/0.45 m, cm or m")
     if raw.chest == raw.names[0]:
-        raise ValueError("has no chest: its arms branch off the root")
+        raise InputError("has no chest: its arms branch off the root")
     rest = next((pose for pose in (1, 0) if is_t_pose(raw, pose)), None)
     if rest is None:
         turns, rest = resting(raw.cut(1, len(poses))), 0
     else:
         turns = facing(raw, rest) * Rotation.from_quat(raw.orientations[rest], scalar_first=True)
     if len(poses) == 1 + rest:
-        raise ValueError("has no frames but the T-pose")
+        raise InputError("has no frames but the T-pose")
 
     offsets = np.zeros_like(raw.offsets)
     offsets[1:] = turns[raw.parents[1:]].apply(raw.offsets[1:])

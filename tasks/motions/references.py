@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from larp_model import bodies
 from larp_model import state as packed
 from larp_model.bodies import standing_height
+from larp_model.errors import InputError
 from larp_model.rotation import turned_about_z
 from larp_model.scene import Body, Link, Scene
 from larp_model.truth.mujoco import Truth, closed, finite
@@ -23,6 +24,8 @@ from tasks.motions.tracking import Tracker
 
 # Steps around the strike in which a captured kick may meet its ball.
 MEETING = 10
+# Least height of the hips above the lower foot at the strike, as a share of the rest pose's.
+STANDING = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,11 +112,11 @@ def embedded(scene: Scene, steps: int = 300, poses: KeyPoses | None = None) -> R
     truth = Truth(scene)
     after, finite = truth.rollout(state[None], controls[None])
     if not finite[0]:
-        raise ValueError("scene: its human cannot perform the embedded reference kick; the truth diverged")
+        raise InputError("scene: its human cannot perform the embedded reference kick; the truth diverged")
     states = np.concatenate([state[None], after[0]])
     moving = np.linalg.norm(states[:, -1, packed.VELOCITY], axis=-1) > 0.5
     if not moving.any():
-        raise ValueError("scene: its human misses the ball in the embedded reference kick")
+        raise InputError("scene: its human misses the ball in the embedded reference kick")
     return Reference(states, controls, int(moving.argmax()) - 1)
 
 
@@ -122,7 +125,7 @@ def motion_of(path: Path, names: Mapping[str, str] | None = None) -> Motion:
     if path.suffix.lower() != ".npz":
         return bvh.load(path, names)
     if names is not None:
-        raise ValueError(f"names are for BVH files, but {path.name} is none: its field joints says the order")
+        raise InputError(f"names are for BVH files, but {path.name} is none: its field joints says the order")
     return angles.load(path)
 
 
@@ -138,19 +141,20 @@ def captured(
     source: a BVH file, an npz file of joint angles (see `angles.load`), or a motion. The ball waits where the foot, as
     performed, would strike it hardest. The whole is turned and moved so that the ball leaves along the x axis (the
     human starts beside it), and mirrored if the kicking foot is the left. names: what a BVH file calls our joints, as
-    in `bvh.load`; by default, the known skeleton that fits it. ValueError where the file is not understood, is no
+    in `bvh.load`; by default, the known skeleton that fits it. InputError where the file is not understood, is no
     kick, or no ball is hit.
     """
     for name, value in (("seconds_before", seconds_before), ("seconds_after", seconds_after)):
         if not 0.2 <= value <= 10.0:
-            raise ValueError(f"{name} is {value!r}, but must be from 0.2 to 10 s")
+            raise InputError(f"{name} is {value!r}, but must be from 0.2 to 10 s")
     motion = source if isinstance(source, Motion) else motion_of(Path(source), names)
     path = "the motion" if isinstance(source, Motion) else source
     if (fastest := skeleton.toe_speed(motion).max()) < skeleton.SLOWEST_KICK:
-        raise ValueError(f"{path} is no kick: its toes reach {fastest:.1f} m/s, but need {skeleton.SLOWEST_KICK:g} m/s")
+        raise InputError(f"{path} is no kick: its toes reach {fastest:.1f} m/s, but need {skeleton.SLOWEST_KICK:g} m/s")
     if skeleton.kicking_side(motion) == "Left":
         motion = skeleton.mirrored(motion)
     frame = skeleton.strike(motion)
+    require_kick(path, motion, frame, scene.dt)
     clip = motion.cut(frame - round(seconds_before * motion.rate), frame + round(seconds_after * motion.rate))
     wanted, controls = _wanted(scene, clip)
     expected, last = round(skeleton.strike(clip) / clip.rate / scene.dt), len(controls) - 1
@@ -161,12 +165,28 @@ def captured(
     after, onwards = tracker.follow(before[touch], touch, last)
     states = np.concatenate([before[:touch], after])
     if not finite(states[None])[0]:
-        raise ValueError(f"{path}: the truth diverges when the human performs this kick")
+        raise InputError(f"{path}: the truth diverges when the human performs this kick")
     moving = np.linalg.norm(states[:, -1, packed.VELOCITY], axis=-1) > 0.5
     if not moving.any():
-        raise ValueError(f"{path}: the human misses the ball when it performs this kick")
+        raise InputError(f"{path}: the human misses the ball when it performs this kick")
     strike = int(moving.argmax()) - 1
     return Reference(_launched_along_x(states, strike), np.concatenate([targets[:touch], onwards]), strike)
+
+
+def require_kick(path: str | Path, motion: Motion, strike: int, dt: float) -> None:
+    """Refuse a motion that begins too late before its strike, a frame of it, or whose person does not stand there."""
+    before, needed = strike / motion.rate, (MEETING + 1) * dt
+    if before < needed:
+        raise InputError(
+            f"{path} begins {before:.2f} s before its strike, but needs {needed:g} s: the foot must be fastest later"
+        )
+    feet = [motion.path(f"{side}Foot")[strike, 2] for side in skeleton.SIDES]
+    high = motion.path("Hips")[strike, 2] - min(feet)
+    if high < STANDING * motion.hip_height:
+        raise InputError(
+            f"{path} is no kick of one who stands: at the strike the hips are {high:.2f} m above the lower foot, "
+            f"but are {motion.hip_height:.2f} m in the rest pose; is the file's up axis another one?"
+        )
 
 
 def _launched_along_x(states: np.ndarray, strike: int) -> np.ndarray:
@@ -236,7 +256,7 @@ def _spot(path: str | Path, scene: Scene, states: np.ndarray, strike: int) -> tu
     push[abs(np.arange(len(way)) - strike) > MEETING] = 0.0
     touch = int(push.argmax())
     if not push[touch] > 0.0:
-        raise ValueError(f"{path}: the foot passes {height[strike]:.2f} m above the centre of a ball, and hits none")
+        raise InputError(f"{path}: the foot passes {height[strike]:.2f} m above the centre of a ball, and hits none")
 
     forwards = np.array([*way[touch, packed.VELOCITY][:2], 0.0]) / speed[touch]
     turn = Rotation.from_quat(way[touch, packed.ORIENTATION], scalar_first=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from larp_model.errors import InputError
 from tasks.motions.skeleton import ENDS, SIDES, Motion, bone
 
 FORWARDS, LEFT, UP = np.eye(3)
@@ -20,10 +21,10 @@ def resting(motion: Motion) -> Rotation:
     """Orientations of the n joints' frames in a T-pose, the person facing x; `motion` in its file's joint frames.
 
     Torso and pelvis have the mean lean of the motion, feet are as steep as with the ankle lowest, and all else (neck,
-    hands, ...) is turned to its parent as it is on average. ValueError where there are too few frames.
+    hands, ...) is turned to its parent as it is on average. InputError where there are too few frames.
     """
     if len(motion.positions) < FRAMES:
-        raise ValueError(
+        raise InputError(
             "has no rest pose: neither its first frame nor its pose without rotations is a T-pose, and"
             f" {len(motion.positions)} frames are too few to make one of, it needs {FRAMES}"
         )

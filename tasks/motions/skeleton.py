@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from larp_model.errors import InputError
 from larp_model.scene import Body
 
 SIDES = ("Left", "Right")
@@ -122,7 +123,7 @@ def retarget(motion: Motion, body: Body, dt: float) -> tuple[np.ndarray, np.ndar
     motors' bounds.
     """
     if not dt > 0.0 or len(motion.positions) < 2:
-        raise ValueError(
+        raise InputError(
             f"dt is {dt!r}, the motion has {len(motion.positions)} frames; needs dt above 0 and two frames"
         )
     times = np.arange(len(motion.positions)) / motion.rate
@@ -140,7 +141,7 @@ def _link_rotation(motion: Motion, link: str) -> Rotation:
     side, _, segment = link.partition("_")
     if segment not in LIMBS:
         if link != "torso" and link not in JOINTS:
-            raise ValueError(f"body has a link {link!r}, but captured motions move a human's links alone")
+            raise InputError(f"body has a link {link!r}, but captured motions move a human's links alone")
         return motion.rotation(JOINTS.get(link, motion.chest))
     joint = side.capitalize() + LIMBS[segment]
     turned = motion.rotation(joint)
@@ -159,7 +160,7 @@ def toe_velocity(motion: Motion, side: str) -> np.ndarray:
     from scipy.signal import savgol_filter  # half a second to import; the embedded kick has no need of it
 
     if len(motion.positions) < SMOOTHING:
-        raise ValueError(f"motion has {len(motion.positions)} frames, but speeds need {SMOOTHING}")
+        raise InputError(f"motion has {len(motion.positions)} frames, but speeds need {SMOOTHING}")
     return savgol_filter(motion.path(f"{side}ToeBase"), SMOOTHING, 2, deriv=1, delta=1.0 / motion.rate, axis=0)
 
 

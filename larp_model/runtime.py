@@ -1,0 +1,71 @@
+"""JAX as this project runs it: on a device that exists, with a compilation cache that is kept between processes."""
+
+from __future__ import annotations
+
+import os
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import jax
+
+from larp_model.errors import InputError
+
+# Of the file times of an entry and of the stamp [ns]: file systems round them.
+TOLERANCE = 1_000_000_000
+
+
+def require_device() -> None:
+    """Refuse a JAX_PLATFORMS that names a device which this machine or installation lacks."""
+    asked = jax.config.jax_platforms  # type: ignore[attr-defined]
+    try:
+        jax.devices()
+    except (AssertionError, RuntimeError):
+        if not asked:
+            raise
+        raise InputError(
+            f"JAX_PLATFORMS is {asked!r}, but this machine or installation has no such device; unset it, or take 'cpu'"
+        ) from None
+
+
+def remember_compilations() -> None:
+    """Remember compiled programs in the user's cache folder, so that a second process starts at once.
+
+    A cache folder that JAX has already (JAX_COMPILATION_CACHE_DIR) stays; without a home, or where its cache folder
+    cannot be written, nothing is remembered.
+    """
+    if jax.config.jax_compilation_cache_dir is not None:  # type: ignore[attr-defined]
+        return
+    try:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "larp-mpc"
+        folder.mkdir(parents=True, exist_ok=True)
+        discard_unreadable(folder)
+    except (RuntimeError, OSError):  # RuntimeError: the user has no home
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+def discard_unreadable(folder: Path) -> None:
+    """Delete the entries of a compilation cache that JAX cannot read, of those written since this was last done.
+
+    JAX never overwrites an entry: what a full disk or a power cut truncated would be compiled anew at every start.
+    """
+    try:
+        from jax._src.compilation_cache import decompress_executable
+    except ImportError:  # private, but the only thing that knows JAX's format
+        return
+    stamp, now = folder / "checked", time.time_ns()
+    checked = stamp.stat().st_mtime_ns if stamp.exists() else 0
+    for entry in folder.glob("*-cache"):
+        with suppress(FileNotFoundError):  # another process deletes them too
+            if entry.stat().st_mtime_ns < checked - TOLERANCE:
+                continue
+            try:
+                decompress_executable(entry.read_bytes())
+            except OSError:
+                raise
+            except Exception:  # zlib and zstandard raise their own
+                entry.unlink()
+    stamp.touch()
+    os.utime(stamp, ns=(now, now))
