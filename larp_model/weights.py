@@ -280,8 +280,27 @@ def _differ(what: str, now: Any, was: Any) -> Iterator[str]:
         yield f"{what} is {now}, but they were trained with {was}"
 
 
+def untrained(model: Model) -> Weights:
+    """Return weights whose networks add nothing: what remains is the physics of the parts."""
+    weights = _blank(model)
+    zeros, ones = (lambda each, value=value: jnp.full(each.shape, value, each.dtype) for value in (0.0, 1.0))
+
+    def statistics(each: Statistics) -> Statistics:
+        return Statistics(zeros(each.mean), ones(each.spread))
+
+    return Weights(
+        jax.tree.map(zeros, weights.networks),
+        *({name: statistics(each) for name, each in group.items()} for group in weights[1:]),
+    )
+
+
 def shapes(model: Model) -> dict[str, tuple[int, ...]]:
     """Names and shapes of the tensors of a model's weights."""
+    return {name: tensor.shape for name, tensor in flatten(_blank(model)).items()}
+
+
+def _blank(model: Model) -> Weights:
+    """The shapes and types of a model's weights."""
     scene = model.scene
 
     def make() -> Weights:
@@ -289,7 +308,9 @@ def shapes(model: Model) -> dict[str, tuple[int, ...]]:
         control, torque = jnp.zeros((1, len(scene.motors), 3)), jnp.zeros((1, len(scene.links), 3))
         return initial_weights(model, jax.random.key(0), measure(model, state, state, control, torque))
 
-    return {name: tensor.shape for name, tensor in flatten(jax.eval_shape(make)).items()}
+    blank = jax.eval_shape(make)
+    assert isinstance(blank, Weights)
+    return blank
 
 
 def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray], needed: Mapping[str, tuple[int, ...]]) -> None:

@@ -6,7 +6,6 @@ import gc
 from collections.abc import Iterator
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import settings
@@ -20,6 +19,7 @@ from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from larp_model.training import Recipe, Windows, statistics_of
 from larp_model.truth.episodes import Episodes
+from larp_model.weights import untrained
 from tasks.data import random_episodes
 from tasks.motions.references import Reference, embedded
 
@@ -101,9 +101,7 @@ def paper_weights(paper: Model, episodes: Episodes) -> Weights:
 
 
 @pytest.fixture(scope="session")
-def mechanical(scene: Scene, episodes: Episodes) -> Simulator:
+def mechanical(scene: Scene) -> Simulator:
     """The kick's scene by mechanics alone: the hybrid design, of which nothing is learned."""
     model = designs.hybrid(scene, designs.LEAST)
-    weights = random_weights(model, episodes)
-    outputs = {name: each._replace(mean=jnp.zeros_like(each.mean)) for name, each in weights.outputs.items()}
-    return Simulator(model, weights._replace(networks=jax.tree.map(jnp.zeros_like, weights.networks), outputs=outputs))
+    return Simulator(model, untrained(model))

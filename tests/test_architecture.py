@@ -44,6 +44,8 @@ ORDER = [
     "larp_model.simulator",
     "larp_model.losses",
     "larp_model.training",
+    "larp_model.prediction",
+    "larp_model.launches",
     "larp_model.evaluation",
     "larp_model.truth.mujoco",
     "larp_model.truth.bullet",

@@ -13,6 +13,8 @@ from larp_model import evaluation
 from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.bodies import human, human_and_ball, segment_of
+from larp_model.launches import launches_of
+from larp_model.prediction import predict
 from larp_model.simulator import Simulator, step
 from tasks.data import random_episodes
 from tasks.live import NOVEL
@@ -28,11 +30,9 @@ def test_the_shipped_chains_err_no_more_than_they_did(name: str, bars: tuple[flo
     model, learned, _ = stored.load(stored.SHIPPED / f"{name}.json", chosen.scene)
     given, _ = chosen.draw(32, 3)
     simulator = Simulator(model, learned)
-    found = evaluation.predict(
-        simulator, given.states[:, 0], given.controls[:, :40], given.torques[:, :40], given.morphology
-    )
+    found = predict(simulator, given.states[:, 0], given.controls[:, :40], given.torques[:, :40], given.morphology)
     usual = np.broadcast_to(chosen.scene.morphology, given.morphology.shape)
-    blind = evaluation.predict(simulator, given.states[:, 0], given.controls[:, :40], given.torques[:, :40], usual)
+    blind = predict(simulator, given.states[:, 0], given.controls[:, :40], given.torques[:, :40], usual)
     error, unseen = (
         np.linalg.norm((each - given.states[:, 1:41])[..., packed.POSITION], axis=-1) for each in (found, blind)
     )
@@ -66,7 +66,7 @@ def test_the_shipped_human_and_what_it_strikes_err_no_more_than_they_did(
         for body, bar in zip(chosen.scene.bodies, limits, strict=True):
             error = windows[steps][body.name]
             assert error is not None and error < bar, f"{body.name} after {steps} steps"
-    launch = evaluation.launch(simulator, given, 3)
+    launch = launches_of(simulator, given, 3).summary
     assert launch["count"] > 10
     assert launch["relative_error"]["median"] < launched[0] and launch["angle_deg"]["median"] < launched[1]
 

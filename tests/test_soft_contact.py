@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from jax import Array
 
-from larp_model import contact, evaluation, meeting
+from larp_model import contact, meeting
 from larp_model import state as packed
 from larp_model.bodies import BALL_SURFACE, two_balls
 from larp_model.designs import hybrid
 from larp_model.kinematics import Kinematics, kinematics, morphology_of
+from larp_model.launches import launches_of
 from larp_model.meeting import Velocities
 from larp_model.parts.contact import Contact, Known
 from larp_model.parts.impacts import FreeImpact, SoftContacts
@@ -165,9 +166,12 @@ def test_a_kicked_ball_leaves_nearly_as_in_the_truth_though_nothing_is_learned(
     scene: Scene, reference: Reference, mechanical: Simulator
 ) -> None:
     episodes, _ = random_episodes(scene, reference, count=256, seed=5, steps=48)
-    found = evaluation.launch(mechanical, episodes, 0)
-    assert found["count"] > 50
-    assert found["relative_error"]["median"] < 0.05
+    found = launches_of(mechanical, episodes, 0)
+    assert len(found.error) > 50 and np.median(found.error) < 0.05
+    assert found.by.any(axis=1).all(), "of every launch it is known which links pushed the ball"
+    assert found.links[found.by.sum(axis=0).argmax()] == "right_foot"
+    kinds = found.summary["kinds"]
+    assert kinds["ball on the ground"]["count"] + kinds["ball in the air"]["count"] == len(found.error)
 
 
 def test_a_ball_that_slides_loses_its_slip_to_the_ground_as_in_the_truth_though_nothing_is_learned(

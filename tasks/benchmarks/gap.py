@@ -140,7 +140,7 @@ def main(
     rows, episodes = candidates_of(kick, models, truth, targets, candidates, seed)
     model, learned, _ = stored.load(weights, kick.scene)
     simulator = Simulator(model, learned)
-    launch = {str(before): evaluation.launch(simulator, episodes, before) for before in (0, 3)}
+    launch = evaluation.launched(simulator, episodes)
     ranks = {
         name: float(np.median([row["rank_correlation"] for row in rows[which::3]]))
         for which, name in enumerate(("first", "middle", "last"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from larp_model import evaluation
+from larp_model import designs, evaluation
 from larp_model import weights as stored
 from larp_model.designs import DesignName
 from larp_model.errors import InputError
@@ -72,6 +72,7 @@ def main(
     bodies: Literal["usual", "varied"] = "usual",
     beside: DesignName | None = None,
     bullet: bool = False,
+    untrained: bool = False,
     publish: bool = False,
 ) -> None:
     """Compare rollouts of the learned simulator with truth episodes from unseen initial states.
@@ -87,16 +88,20 @@ def main(
         bodies: varied draws another human for every episode.
         beside: weights of this design, from where `tasks.train --design` leaves them, on the same episodes.
         bullet: also how far Bullet, the second truth, strays from the first.
+        untrained: the hybrid design as it is, all its networks zero: physics alone.
         publish: put the table into RESULTS.md.
     """
+    if untrained and weights:
+        raise InputError(f"untrained is set, but weights is {str(weights)!r}: physics alone has none")
     chosen = around(scenario(scene), reference, bodies == "varied")
     if sequences < 1:
         raise InputError(f"sequences is {sequences}, but must be at least 1")
-    manifest = weights_of(scene, weights)
+    manifest = None if untrained else weights_of(scene, weights)
     what = [
         scene,
         *(path.stem for path in (weights, reference) if path),
         *(["bodies varied"] if bodies == "varied" else []),
+        *(["untrained"] if untrained else []),
     ]
     name = "_".join(["model", *what]).replace(" ", "_")
     json = json or Path(f"runs/benchmarks/{name}.json")
@@ -116,6 +121,8 @@ def main(
         source += f" --reference {reference.name}"
     if bodies == "varied":
         source += " --bodies varied"
+    if untrained:
+        source += " --untrained"
     if beside:
         source += f" --beside {beside}"
         found["beside"] = {"design": beside, **judged(other, chosen, episodes)}
@@ -126,15 +133,20 @@ def main(
     report.write_json(json, {"command": command, "hardware": report.hardware(), **found})
     title = f"{', '.join(what)}: {len(episodes.states)} sequences"
     report.write_picture(json.with_suffix(".png"), picture(found["windows"], chosen, title))
-    table = table_of(found, chosen)
-    report.show(table)
+    tables = [table_of(found, chosen), *launch_tables(found["launch"])]
+    for table in tables:
+        report.show(table)
     if publish:
-        report.publish(name, f"Model: {', '.join(what)}", command, table)
+        report.publish(name, f"Model: {', '.join(what)}", command, *tables)
 
 
-def judged(manifest: Path, chosen: Scenario, episodes: Episodes) -> dict[str, Any]:
-    """What `evaluation.evaluate` finds of some weights, and how long a step of them takes."""
-    simulator = Simulator(*stored.load(manifest, chosen.scene)[:2])
+def judged(manifest: Path | None, chosen: Scenario, episodes: Episodes) -> dict[str, Any]:
+    """What `evaluation.evaluate` finds of some weights, or of physics alone, and how long a step of them takes."""
+    if manifest is None:
+        model = designs.hybrid(chosen.scene)
+        simulator = Simulator(model, stored.untrained(model))
+    else:
+        simulator = Simulator(*stored.load(manifest, chosen.scene)[:2])
     found = evaluation.evaluate(simulator, episodes, chosen.windows)
     return found | {"us_per_step": {str(size): step_time(simulator, episodes, size) for size in BATCHES}}
 
@@ -202,13 +214,25 @@ def table_of(found: dict[str, Any], chosen: Scenario) -> Table:
         name = f", the {whose['design']} design" if whose is not found else ""
         cells = (f"{value:.3g} us, {size} side by side" for size, value in whose["us_per_step"].items())
         table.add_row(f"a step of a scene{name}", *cells)
-    for before, launch in found["launch"].items():
+    return table
+
+
+def launch_tables(found: dict[str, Any]) -> Iterator[Table]:
+    """Errors of launches, all and by kind, from so many steps before contact: a table each; see `Launches.summary`."""
+    for before, launch in found.items():
         if not launch["count"]:
             continue
-        for measure, unit in (("relative_error", ""), ("angle_deg", " deg")):
-            cells = (f"{name} {value:.3g}{unit}" for name, value in launch[measure].items())
-            table.add_row(f"launch from {before} steps before contact, {measure}, {launch['count']} times", *cells)
-    return table
+        quantiles = "median / 75 % / 90 %"
+        table = Table(
+            "launches", "count", f"velocity, {quantiles} [%]", f"direction, {quantiles} [degrees]",
+            title=f"Launch, from the true state {before} steps before first contact",
+        )  # fmt: skip
+        for kind, figures in {"all": launch, **launch["kinds"]}.items():
+            errors = (100.0 * value for value in figures["relative_error"].values())
+            angles = figures["angle_deg"].values()
+            cells = (" / ".join(f"{value:.1f}" for value in values) for values in (errors, angles))
+            table.add_row(kind, str(figures["count"]), *cells)
+        yield table
 
 
 if __name__ == "__main__":

@@ -114,10 +114,16 @@ def write_picture(path: Path, figure: Figure) -> None:
         figure.savefig(file, format="png", dpi=120)
 
 
-def publish(name: str, title: str, command: str, table: Table) -> None:
-    """Put a benchmark's table into RESULTS.md, in place of its last one, with the command above it."""
+def publish(name: str, title: str, command: str, *tables: Table) -> None:
+    """Put a benchmark's tables into RESULTS.md, in place of its last ones, with the command above them.
+
+    Tables after the first have their titles above them.
+    """
     begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
-    part = f"{begin}\n## {title}\n\n`{command}`\n\n{markdown(table)}\n\nMeasured on {hardware()}.\n{end}"
+    first, *others = map(markdown, tables)
+    texts = [first, *(f"{table.title}:\n\n{other}" for table, other in zip(tables[1:], others, strict=True))]
+    shown = "\n\n".join(texts)
+    part = f"{begin}\n## {title}\n\n`{command}`\n\n{shown}\n\nMeasured on {hardware()}.\n{end}"
     text = RESULTS.read_text()
     if begin in text:
         before, after = text.split(begin)[0], text.split(end)[1]

@@ -1,0 +1,44 @@
+"""Rollouts of many episodes, in chunks that one compiled program serves."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from larp_model.networks import Weights
+from larp_model.parts.part import Model
+from larp_model.simulator import Simulator
+
+# Steps, to whose multiples rollouts are filled up: one program, then, serves all windows of a kick.
+PADDED = 64
+
+
+def predict(
+    simulator: Simulator, states: np.ndarray, controls: np.ndarray, torques: np.ndarray, morphology: np.ndarray,
+    chunk: int = 128,
+) -> np.ndarray:  # fmt: skip
+    """States (E, H, L, 13) that the simulator predicts from states (E, L, 13), chunk by chunk.
+
+    What is compiled serves any H up to a multiple of `PADDED`.
+    """
+    parts, steps = [], controls.shape[1]
+    rest = ((0, 0), (0, -steps % PADDED), (0, 0), (0, 0))
+    controls, torques = np.pad(controls, rest), np.pad(torques, rest)
+    for begin in range(0, len(states), chunk):
+        rows = np.minimum(np.arange(begin, begin + chunk), len(states) - 1)
+        start, targets, pushes, sizes = (jnp.asarray(each[rows]) for each in (states, controls, torques, morphology))
+        rolled = _roll(simulator.model, simulator.weights, start, targets, pushes, sizes, jnp.asarray(steps))
+        parts.append(np.asarray(rolled)[:, :steps])
+    return np.concatenate(parts)[: len(states)]
+
+
+@partial(jax.jit, static_argnums=0)
+def _roll(
+    model: Model, weights: Weights, start: Array, targets: Array, pushes: Array, sizes: Array, steps: Array
+) -> Array:
+    """Compiled once for all weights of a model."""
+    return Simulator(model, weights).rollout(start, targets, torques=pushes, morphology=sizes, steps=steps)
