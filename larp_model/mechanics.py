@@ -255,7 +255,7 @@ def responses(body: Body, rows: np.ndarray, matrices: Array, morphology: Array, 
         for links, parents in tree(body)
     ]
     whole, _, joined = inwards(inertias(body, matrices, sizes), Push(still, still), levels)
-    gives = {0: _inverse(Inertia(*(block[:1] for block in whole)))}
+    gives = {0: inverse(Inertia(*(block[:1] for block in whole)))}
     # A scan over levels, filled up to as many links of each, because as many copies take long to compile.
     needed = _ancestry(body, rows)
     lines = [line for level in levels if len(line := level.rows[np.isin(level.rows, needed)])]
@@ -290,7 +290,7 @@ def _ancestry(body: Body, rows: np.ndarray) -> list[int]:
     return found
 
 
-def _inverse(inertia: Inertia) -> Inertia:
+def inverse(inertia: Inertia) -> Inertia:
     """From momenta to spin and velocity."""
     still = invert(inertia.moving)
     lever = mm(inertia.mixed, still)

@@ -30,6 +30,8 @@ ORDER = [
     "larp_model.compliance",
     "larp_model.meeting",
     "larp_model.mechanics",
+    "larp_model.physics.contact",
+    "larp_model.physics",
     "larp_model.networks",
     "larp_model.parts.part",
     "larp_model.parts.sphere",

@@ -1,0 +1,1 @@
+"""Physics that needs no learning: see `contact`."""

@@ -1,0 +1,532 @@
+"""One step in time of an articulated body, a ball and the ground, all their contacts in one solve.
+
+The law is MuJoCo's soft contact (its documentation, "Computation", "Constraint model"). A contact point has the
+relative velocity u, the normal n and the gap p < 0. Its force f and acceleration a obey
+
+    a + R f = a_ref,    f in the friction cone K,    a_ref = -b / d u - k / d p n,    R = (1 - d) / d w
+
+with the surface's stiffness k and damping b, the impedance d, and the inverse weight w of both links in the reference
+pose: f is the projection of (a_ref - a) / R onto K. Friction and normal force are found together: where a contact
+slides, its normal acceleration rises with the slip (E. Todorov, "Convex and analytically invertible dynamics with
+contacts and constraints", 2014). Over a time step h, of the impulse J = h f,
+
+    J = P_K(m (u_ref - u')),    m = 1 / R [kg],    u_ref = u + h a_ref,    u' = u + h a
+
+All J are found by Newton's method with an exact line search. Linear around the last u', J = q - M u', a contact is a
+mass M that moves along, and the articulated-body algorithm takes it into its inertia. The ball is eliminated from its
+contacts first; where several links touch it at once, each sees what the others did in the iteration before, which
+converges more slowly.
+
+Arrays have the batch last, as in `mechanics`: vectors (n, 3, B), matrices (n, 3, 3, B).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from larp_model import state as packed
+from larp_model.compliance import moments
+from larp_model.contact import IMPEDANCE, Axis, nearest
+from larp_model.errors import InputError
+from larp_model.kinematics import strength
+from larp_model.mechanics import (
+    Anchors,
+    Ends,
+    Inertia,
+    Level,
+    Push,
+    cross,
+    cross_columns,
+    cross_rows,
+    held,
+    inertias,
+    inverse,
+    local_anchors,
+    mm,
+    mv,
+    responses,
+    servos,
+    solve,
+    tree,
+    turn,
+    turned_anchors,
+    turns,
+)
+from larp_model.scene import Body, Scene, Surface
+from larp_model.vector import Vector
+
+Velocities = tuple[Array, Array, Array, Array]
+"""[m/s] and [rad/s] of the links (n, 3, B), and of the ball (1, 3, B)."""
+
+AtContacts = tuple[Array, Array, Array]
+"""Of the contacts of links with the ground, of the ball with the ground, of links with the ball, (n, 3, B) each."""
+
+Tree = TypeVar("Tree", Inertia, Push)
+
+# Halvings of the interval in which the line search looks: to a 256th of a step.
+HALVINGS = 8
+
+
+class Contacts(NamedTuple):
+    """n contact points, each of a link and what it touches.
+
+    arm: (n, 3, B) [m] from the link's centre. normal: (n or 1, 3, B or 1). reference: u_ref (n, 3, B) [m/s]. mass: m
+    (n, 1, B or 1) [kg]. active: (n, 1, B) 1 where the gap is negative, else 0. friction: coefficient.
+    """
+
+    arm: Array
+    normal: Array
+    reference: Array
+    mass: Array
+    active: Array
+    friction: float
+
+    @staticmethod
+    def of(
+        surface: Surface, arm: Array, normal: Array, velocity: Array, gap: Array, inverse_weight: Array, h: float
+    ) -> Contacts:
+        """Contacts of relative velocity (n, 3, B) [m/s], gap (n, 1, B) [m] and inverse weight (n, 1, B or 1) [1/kg]."""
+        slowed = velocity * (1.0 - h * surface.damping / IMPEDANCE)
+        reference = slowed - h * surface.stiffness / IMPEDANCE * gap * normal
+        mass = IMPEDANCE / ((1.0 - IMPEDANCE) * inverse_weight)
+        return Contacts(arm, normal, reference, mass, held((gap < 0.0).astype(gap.dtype)), surface.friction)
+
+    def impulse(self, velocity: Array) -> Array:
+        """J (n, 3, B) [N s] at velocities u' (n, 3, B)."""
+        return self.active * projection(self.mass * (self.reference - velocity), self.normal, self.friction)[0]
+
+    def linear(self, velocity: Array) -> tuple[Array, Array]:
+        """M (n, 3, 3, B) [kg] and q (n, 3, B) [N s] of J = q - M u', around velocities u' (n, 3, B)."""
+        impulse, slope = projection(self.mass * (self.reference - velocity), self.normal, self.friction)
+        mass = held((self.active * self.mass)[:, None] * slope)
+        return mass, self.active * impulse + mv(mass, velocity)
+
+
+def projection(wanted: Array, normal: Array, friction: float) -> tuple[Array, Array]:
+    """The points (n, 3, B) of the friction cone that are nearest to those wanted, and the slopes (n, 3, 3, B)."""
+    unit = jnp.eye(3, dtype=wanted.dtype)[..., None]
+    along = jnp.sum(wanted * normal, axis=1, keepdims=True)
+    tangent = wanted - along * normal
+    length = jnp.sqrt(jnp.sum(tangent**2, axis=1, keepdims=True) + 1e-12)
+    direction = tangent / length
+    edge = normal + friction * direction
+    share = (along + friction * length) / (1.0 + friction**2)
+    across = unit - normal[:, :, None] * normal[:, None] - direction[:, :, None] * direction[:, None]
+    bent = jnp.clip(friction * share / length, 0.0, 1.0)
+    sliding = edge[:, :, None] * edge[:, None] / (1.0 + friction**2) + bent[:, None] * across
+    # One decision for all blocks of a matrix: a compiler may work it out anew for each, and round otherwise.
+    inside, pushed = held((length <= friction * along, friction * length > -along))
+    point = jnp.where(inside, wanted, share * edge) * pushed
+    return point, jnp.where(inside[:, None], unit, sliding) * pushed[:, None]
+
+
+def inverse_weights(scene: Scene, morphology: Array) -> Array:
+    """(L, B or 1) [1/kg] mean velocity gained by a link's centre per impulse there, in the reference pose.
+
+    MuJoCo's constant approximation, `body_invweight0`, by which R is set. morphology (B or 1, L, 3).
+    """
+    parts = []
+    for body in scene.bodies:
+        sizes = morphology[:, scene.rows(body.name)]
+        upright = jnp.broadcast_to(jnp.eye(3, dtype=sizes.dtype), (sizes.shape[0], len(body.links), 3, 3))
+        gained = responses(body, np.arange(len(body.links)), upright, sizes, (0.0,))[0]
+        parts.append(jnp.trace(gained[..., :3, :3], axis1=-2, axis2=-1).T / 3.0)
+    return jnp.concatenate(parts)
+
+
+def step(
+    scene: Scene, state: Array, control: Array, torque: Array, morphology: Array, weights: Array, h: float,
+    iterations: int = 6,
+) -> Array:  # fmt: skip
+    """States (B, L, 13) `h` [s] after states (B, L, 13), as MuJoCo's semi-implicit Euler rule has them.
+
+    scene: an articulated body, and a ball that it may touch. control (B, J, 3) [rad], torque (B, L, 3) [N m],
+    morphology (B or 1, L, 3). weights: see `inverse_weights`. Damping is implicit; contact forces are found with
+    undamped joints, as in the engine's `implicitfast`.
+    """
+    require_supported(scene)
+    body, links = scene.bodies[0], len(scene.bodies[0].links)
+    whole, targets, outside, sizes = (jnp.moveaxis(each, 0, -1) for each in (state, control, torque, morphology))
+    free = Free.of(body, whole[:links], targets, outside[:links], sizes[:links], scene.gravity, h)
+    ball = Ball.of(whole[links:], outside[links:], sizes[links:], scene.gravity, h)
+    touching = Touching.of(scene, free, ball, sizes, weights[:, None], h)
+    on_links, on_floor, between = impulses_of(free, ball, touching, iterations)
+
+    ends, rows = touching.ends, touching.rows
+    pushed = _sum(
+        free.push, _both_ends(_push(ends.arm, on_links)), _onto(rows, links, _push(touching.links.arm, -between))
+    )
+    velocity, spin = solve(free.inertia, pushed, free.levels)
+    on_ball = _sum(ball.push, _push(touching.floor.arm, on_floor), _total(_push(touching.ball_arm, between)))
+    ball_velocity, ball_spin = _moved(inverse(ball.inertia), on_ball)
+    moved = _moved_on(body, free, velocity, spin, h)
+    rolled = ball.place + h * ball_velocity, turn(ball.orientation, h * ball_spin), ball_velocity, ball_spin
+    after = jnp.concatenate([jnp.concatenate(each, axis=1) for each in (moved, rolled)])
+    return jnp.moveaxis(after, -1, 0)
+
+
+def require_supported(scene: Scene) -> None:
+    """Refuse scenes other than of an articulated body and a ball."""
+    kinds = [body.is_ball for body in scene.bodies]
+    if kinds != [False, True] or len(scene.pairs) != 1 or scene.pairs[0].of_itself:
+        names = ", ".join(body.kind for body in scene.bodies)
+        raise InputError(f"scene has {names}, but needs an articulated body, a ball, and their pair alone")
+
+
+class Free(NamedTuple):
+    """The articulated body within a step, without contacts, in the frames of the step's beginning.
+
+    place, orientation, velocity, spin: at the beginning. tied: from links' centres to their joints. inertia, push:
+    what is known of the links. levels, undamped: the joints, with and without damping. carried (n - 1, 3, B) [rad/s]:
+    what the relative spin gains as its frame turns. drift, drift_turning: what links gain [m/s, rad/s] where neither
+    root nor joints accelerate. matrices: rotations.
+    """
+
+    place: Array
+    orientation: Array
+    velocity: Array
+    spin: Array
+    matrices: Array
+    tied: Anchors
+    inertia: Inertia
+    push: Push
+    levels: list[Level]
+    undamped: list[Level]
+    carried: Array
+    drift: Array
+    drift_turning: Array
+
+    @staticmethod
+    def of(body: Body, state: Array, targets: Array, outside: Array, sizes: Array, gravity: float, h: float) -> Free:
+        """Of a body in states (n, 13, B) under joint targets (j, 3, B) [rad] and torques (n, 3, B) [N m]."""
+        place, orientation, velocity, spin = _columns(state)
+        matrices, parents = turns(orientation), np.array([joint.parent for joint in body.joints], int)
+        inertia = inertias(body, matrices, sizes)
+        momentum = mv(inertia.turning, spin)
+        falling = velocity + h * jnp.array([0.0, 0.0, -gravity], state.dtype)[:, None]
+        push = Push(momentum + h * (outside - cross(spin, momentum)), sizes[:, 2:3] * falling)
+        stronger = strength(body, jnp.moveaxis(sizes, -1, 0))
+        tied = turned_anchors(body, local_anchors(body, sizes), matrices)
+        # How the two points of a joint accelerate apart as their links turn.
+        closing = h * (
+            cross(spin[parents], cross(spin[parents], tied.parent)) - cross(spin[1:], cross(spin[1:], tied.child))
+        )
+        # Armature and damping act on the relative spin as the child sees it.
+        relative = spin[1:] - spin[parents]
+        carried = h * cross(spin[1:], relative)
+        armature, damping = _resistances(body, stronger)
+        pull, _ = servos(body, orientation, matrices, targets, spin, h, stronger)
+        pull = pull + (armature + h * damping) * carried
+        unit = jnp.broadcast_to(jnp.eye(3, dtype=state.dtype)[..., None], (*relative.shape[:2], *relative.shape[1:]))
+
+        def levels(pull: Array, hold: Array) -> list[Level]:
+            given = *tied, closing, pull, hold[:, :, None] * unit
+            return [Level(rows, above, *(each[rows - 1] for each in given)) for rows, above in tree(body)]
+
+        drift = _velocity_products(body, tied, closing, carried)
+        damped = levels(pull, armature + h * damping)
+        undamped = levels(pull - h * damping * (relative + carried), armature)
+        return Free(
+            place, orientation, velocity, spin, matrices, tied, inertia, push, damped, undamped, carried, *drift
+        )  # fmt: skip
+
+
+class Ball(NamedTuple):
+    """The ball within a step, without contacts."""
+
+    place: Array
+    orientation: Array
+    velocity: Array
+    spin: Array
+    radius: Array
+    inertia: Inertia
+    push: Push
+
+    @staticmethod
+    def of(state: Array, outside: Array, sizes: Array, gravity: float, h: float) -> Ball:
+        """Of a ball in states (1, 13, B) under torques (1, 3, B) [N m]."""
+        place, orientation, velocity, spin = _columns(state)
+        turning, mass = moments(*(sizes[:, column] for column in range(3)))[0][:, None], sizes[:, 2:3]
+        unit = jnp.broadcast_to(jnp.eye(3, dtype=state.dtype)[..., None], (1, 3, *spin.shape[1:]))
+        falling = velocity + h * jnp.array([0.0, 0.0, -gravity], state.dtype)[:, None]
+        inertia = Inertia(turning[:, :, None] * unit, jnp.zeros_like(unit), mass[:, :, None] * unit)
+        push = Push(turning * spin + h * outside, mass * falling)
+        return Ball(place, orientation, velocity, spin, sizes[:, 1:2], inertia, push)
+
+
+class Touching(NamedTuple):
+    """All contacts of a step: ends of links with the ground, the ball with it, and links, by their rows, with the ball.
+
+    ball_arm: (P, 3, B) [m] from the ball's centre to where links touch it.
+    """
+
+    ends: Contacts
+    floor: Contacts
+    links: Contacts
+    ball_arm: Array
+    rows: np.ndarray
+
+    @staticmethod
+    def of(scene: Scene, free: Free, ball: Ball, sizes: Array, weight: Array, h: float) -> Touching:
+        """Contacts of a body and a ball, of sizes (L, 3, B) and inverse weights (L, 1, B or 1) [1/kg]."""
+        (body, sphere), (pair,), links = scene.bodies, scene.pairs, len(scene.bodies[0].links)
+        up = jnp.array([0.0, 0.0, 1.0], free.place.dtype)[None, :, None]
+        found = Ends.of(body, free.matrices, free.place[:, 2:], free.velocity, free.spin, sizes[:links], h)
+        # Contact points are midway between the surfaces.
+        found = found._replace(arm=found.arm - 0.5 * found.clearance * up)
+        speed = found.velocity(free.velocity, free.spin)
+        twice = jnp.concatenate([weight[:links], weight[:links]])
+        ends = Contacts.of(body.surface, found.arm, up, speed, found.clearance, twice, h)
+        gap = ball.place[:, 2:] - ball.radius
+        lowest = -(ball.radius + 0.5 * gap) * up
+        falling = ball.velocity + cross(ball.spin, lowest)
+        floor = Contacts.of(sphere.surface, lowest, up, falling, gap, weight[links:], h)
+        rows = np.array([body.link(name) for name in pair.first_links])
+        arm, ball_arm, normal, apart = _closest(body, rows, free, ball, sizes[rows])
+        relative = ball.velocity + cross(ball.spin, ball_arm) - free.velocity[rows] - cross(free.spin[rows], arm)
+        hit = Contacts.of(pair.surface, arm, normal, relative, apart, weight[rows] + weight[links:], h)
+        # Of a contact's acceleration the engine counts what root and joints gain, not what follows from velocities.
+        ends = ends._replace(reference=ends.reference + found.velocity(free.drift, free.drift_turning))
+        drift = free.drift[rows] + cross(free.drift_turning[rows], arm)
+        return Touching(ends, floor, hit._replace(reference=hit.reference - drift), ball_arm, rows)
+
+    def velocities(self, moving: Velocities) -> AtContacts:
+        """Relative velocities [m/s] at all contacts."""
+        velocity, spin, ball_velocity, ball_spin = moving
+        at_ends = jnp.concatenate([velocity, velocity]) + cross(jnp.concatenate([spin, spin]), self.ends.arm)
+        on_ball = ball_velocity + cross(ball_spin, self.ball_arm)
+        return at_ends, ball_velocity + cross(ball_spin, self.floor.arm), on_ball - self.of_links(velocity, spin)
+
+    def of_links(self, velocity: Array, spin: Array) -> Array:
+        """Velocities [m/s] of links where they touch the ball."""
+        return velocity[self.rows] + cross(spin[self.rows], self.links.arm)
+
+    @property
+    def kinds(self) -> tuple[Contacts, Contacts, Contacts]:
+        """All contacts."""
+        return self.ends, self.floor, self.links
+
+
+def impulses_of(free: Free, ball: Ball, touching: Touching, iterations: int) -> AtContacts:
+    """The impulses [N s] of all contacts, by Newton's method; see the module."""
+
+    def newton(found: tuple[Velocities, AtContacts], first: Array) -> tuple[tuple[Velocities, AtContacts], None]:
+        moving, impulses = found
+        new_moving, new_impulses = _newton_step(free, ball, touching, moving)
+        before, after = touching.velocities(moving), touching.velocities(new_moving)
+        share = _line_search(touching.kinds, before, after, impulses, new_impulses)
+        share = jnp.where(first, 1.0, share)  # velocities at the beginning are no solution for any impulses
+        mixed: tuple[Velocities, AtContacts] = jax.tree.map(
+            lambda old, new: old + share * (new - old), found, (new_moving, new_impulses)
+        )
+        return mixed, None
+
+    begun = free.velocity, free.spin, ball.velocity, ball.spin
+    nothing = jax.tree.map(jnp.zeros_like, touching.velocities(begun))
+    (_, impulses), _ = jax.lax.scan(newton, (begun, nothing), jnp.arange(iterations) == 0)
+    return impulses
+
+
+def _newton_step(free: Free, ball: Ball, touching: Touching, guess: Velocities) -> tuple[Velocities, AtContacts]:
+    """Velocities and impulses where all contacts are linear around a guess."""
+    at_ends, at_floor, between = touching.velocities(guess)
+    before, arm = touching.of_links(*guess[:2]), touching.ball_arm
+    end_mass, end_push = touching.ends.linear(at_ends)
+    floor_mass, floor_push = touching.floor.linear(at_floor)
+    mass, push = touching.links.linear(between)
+    # The ball on the ground, and with the masses of all contacts with links.
+    on_floor = _sum(ball.inertia, _inertia(touching.floor.arm, floor_mass))
+    fixed = _sum(ball.push, _push(touching.floor.arm, floor_push))
+    gives = inverse(_sum(on_floor, _total(_inertia(arm, mass))))
+    # What it does under all contacts, as links moved before, but the one that is looked at.
+    follows = _push(arm, mv(mass, before))
+    pushed = _sum(fixed, _total(_sum(_push(arm, push), follows)))
+    ball_velocity, ball_spin = _moved(gives, jax.tree.map(jnp.subtract, pushed, follows))
+    on_links = mass - mm(mass, mm(_admittance(gives, arm), mass))
+    pressed = push - mv(mass, ball_velocity + cross(ball_spin, arm))
+    links, rows = free.place.shape[0], touching.rows
+    bears = _sum(
+        free.inertia, _both_ends(_inertia(touching.ends.arm, end_mass)),
+        _onto(rows, links, _inertia(touching.links.arm, on_links)),
+    )  # fmt: skip
+    pushes = _sum(
+        free.push, _both_ends(_push(touching.ends.arm, end_push)),
+        _onto(rows, links, _push(touching.links.arm, -pressed)),
+    )  # fmt: skip
+    bears, pushes = held((bears, pushes))
+    velocity, spin = solve(bears, pushes, free.undamped)
+    # The ball takes what its links have felt, so that momentum is kept where several touch it.
+    felt = pressed + mv(on_links, touching.of_links(velocity, spin))
+    moving = velocity, spin, *_moved(inverse(on_floor), _sum(fixed, _total(_push(arm, felt))))
+    at_ends, at_floor, _ = touching.velocities(moving)
+    return moving, (end_push - mv(end_mass, at_ends), floor_push - mv(floor_mass, at_floor), felt)
+
+
+def _line_search(
+    kinds: tuple[Contacts, ...], before: AtContacts, after: AtContacts, was: AtContacts, new: AtContacts
+) -> Array:
+    """Share (B,) of a Newton step that makes the cost of the convex problem least.
+
+    The cost's slope along the step is that of velocities at the contacts, from `before` to `after`, times what the
+    impulses, which the velocities came from, are more than those that the velocities call for.
+    """
+
+    def slope(share: Array) -> Array:
+        total = jnp.zeros_like(share)
+        for kind, first, last, one, two in zip(kinds, before, after, was, new, strict=True):
+            change = last - first
+            more = one + share * (two - one) - kind.impulse(first + share * change)
+            total += jnp.sum(change * more, axis=(0, 1))
+        return total
+
+    whole = jnp.ones_like(before[0][0, 0])
+
+    def halve(bounds: tuple[Array, Array], nothing: None) -> tuple[tuple[Array, Array], None]:
+        low, high = bounds
+        middle = 0.5 * (low + high)
+        rising = slope(middle) > 0.0
+        return (jnp.where(rising, low, middle), jnp.where(rising, middle, high)), None
+
+    (low, high), _ = jax.lax.scan(halve, (jnp.zeros_like(whole), whole), length=HALVINGS)
+    return jnp.where(slope(whole) <= 0.0, whole, 0.5 * (low + high))
+
+
+def _velocity_products(body: Body, tied: Anchors, closing: Array, carried: Array) -> tuple[Array, Array]:
+    """What links gain within a step, (n, 3, B) [m/s] and [rad/s], where neither root nor joints accelerate.
+
+    closing, carried: what a joint's points, and the relative spin, gain in the frames of the world.
+    """
+    velocity = spin = jnp.zeros_like(closing[:1])
+    rows = np.array([0])
+    for level, above in tree(body):
+        known, joint = _places(rows, above), level - 1
+        turning = spin[known] + carried[joint]
+        carries = velocity[known] + cross(spin[known], tied.parent[joint])
+        moving = carries - cross(turning, tied.child[joint]) + closing[joint]
+        velocity, spin = jnp.concatenate([velocity, moving]), jnp.concatenate([spin, turning])
+        rows = np.concatenate([rows, level])
+    order = np.argsort(rows)
+    return velocity[order], spin[order]
+
+
+def _moved_on(body: Body, free: Free, velocity: Array, spin: Array, h: float) -> tuple[Array, Array, Array, Array]:
+    """Place, orientation, velocity and spin of all links `h` later, their joints closed.
+
+    velocity, spin: at the end, in the frames of the beginning. As in the engine, root and joints go on with their new
+    velocities, each seen from its own frame, and links follow from the root outwards.
+    """
+    relative = spin[1:] - spin[np.array([joint.parent for joint in body.joints], int)] - free.carried
+    rows, turned = np.array([0]), _turned(h * spin[:1])
+    places, speeds, spins = free.place[:1] + h * velocity[:1], velocity[:1], spin[:1]
+    for level, above in tree(body):
+        known, joint = _places(rows, above), level - 1
+        before = turns(turned[known])
+        after = _times(turned[known], _turned(h * relative[joint]))
+        near, far = mv(before, free.tied.parent[joint]), mv(turns(after), free.tied.child[joint])
+        turning = spins[known] + mv(before, relative[joint])
+        moving = speeds[known] + cross(spins[known], near) - cross(turning, far)
+        places = jnp.concatenate([places, places[known] + near - far])
+        speeds, spins = jnp.concatenate([speeds, moving]), jnp.concatenate([spins, turning])
+        turned, rows = jnp.concatenate([turned, after]), np.concatenate([rows, level])
+    order = np.argsort(rows)
+    return places[order], _times(turned[order], free.orientation), speeds[order], spins[order]
+
+
+def _closest(
+    body: Body, rows: np.ndarray, free: Free, ball: Ball, sizes: Array
+) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+    """Of links and the ball: arms to the contact points from both centres, normals (P, 3, B), gaps (P, 1, B) [m]."""
+    axes = jnp.array([body.links[row].axis for row in rows], free.place.dtype)[..., None]
+    half, centre = 0.5 * sizes[:, :1] * mv(free.matrices[rows], axes), free.place[rows]
+    zero = jnp.zeros_like(centre[:, 0])
+    link = Axis(_vector(centre), _vector(half), sizes[:, 1] + zero)
+    other = Axis(_vector(jnp.broadcast_to(ball.place, half.shape)), Vector(zero, zero, zero), ball.radius[:, 0] + zero)
+    normal, gap, point, _ = nearest(link, other)
+    normals, points = (jnp.stack([each.x, each.y, each.z], axis=1) for each in (normal, point))
+    return points - centre, points - ball.place, normals, gap[:, None]
+
+
+def _resistances(body: Body, stronger: Array) -> tuple[Array, Array]:
+    """Armature [kg m^2] and damping [N m s/rad] of the joints, (n - 1, 1, B or 1) each."""
+    motors = [joint.motor for joint in body.joints]
+    armature = jnp.array([[motor.armature if motor else 0.0] for motor in motors])[..., None] * stronger
+    damping = jnp.array([[motor.damping if motor else 0.0] for motor in motors])[..., None] * stronger
+    return armature, damping + jnp.array([[0.0 if joint.motor else joint.damping] for joint in body.joints])[..., None]
+
+
+def _columns(state: Array) -> tuple[Array, Array, Array, Array]:
+    """Position, orientation, velocity and spin of states (n, 13, B)."""
+    place, orientation, velocity, spin = (
+        state[:, columns] for columns in (packed.POSITION, packed.ORIENTATION, packed.VELOCITY, packed.ANGULAR_VELOCITY)
+    )
+    return place, orientation, velocity, spin
+
+
+def _places(rows: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    return np.array([int(np.flatnonzero(rows == row)[0]) for row in wanted])
+
+
+def _vector(vectors: Array) -> Vector:
+    return Vector(vectors[:, 0], vectors[:, 1], vectors[:, 2])
+
+
+def _turned(rotation_vector: Array) -> Array:
+    """Quaternions (n, 4, B) of small rotation vectors (n, 3, B) [rad]."""
+    still = jnp.zeros_like(rotation_vector[:, :1])
+    return turn(jnp.concatenate([still + 1.0, still, still, still], axis=1), rotation_vector)
+
+
+def _times(first: Array, second: Array) -> Array:
+    """Products of quaternions (n, 4, B)."""
+    a, u, b, v = first[:, :1], first[:, 1:], second[:, :1], second[:, 1:]
+    product = jnp.concatenate([a * b - jnp.sum(u * v, axis=1, keepdims=True), a * v + b * u + cross(u, v)], axis=1)
+    return product * jax.lax.rsqrt(jnp.sum(product**2, axis=1, keepdims=True))
+
+
+def _inertia(arm: Array, mass: Array) -> Inertia:
+    """Of masses (n, 3, 3, B) at arms (n, 3, B), about where the arms begin."""
+    mixed = cross_columns(arm, mass)
+    return Inertia(-cross_rows(mixed, arm), mixed, mass)
+
+
+def _push(arm: Array, impulse: Array) -> Push:
+    return Push(cross(arm, impulse), impulse)
+
+
+def _sum(*parts: Tree) -> Tree:
+    result: Tree = jax.tree.map(lambda *each: sum(each[1:], each[0]), *parts)
+    return result
+
+
+def _total(parts: Tree) -> Tree:
+    result: Tree = jax.tree.map(lambda each: jnp.sum(each, axis=0, keepdims=True), parts)
+    return result
+
+
+def _both_ends(ends: Tree) -> Tree:
+    """Of links (n, ...), from both ends of all of them (2 n, ...)."""
+    result: Tree = jax.tree.map(lambda each: each[: len(each) // 2] + each[len(each) // 2 :], ends)
+    return result
+
+
+def _onto(rows: np.ndarray, links: int, parts: Tree) -> Tree:
+    """Of all links, where those of these rows have parts and the others nothing."""
+    result: Tree = jax.tree.map(lambda each: jnp.zeros((links, *each.shape[1:]), each.dtype).at[rows].add(each), parts)
+    return result
+
+
+def _moved(gives: Inertia, push: Push) -> tuple[Array, Array]:
+    """Velocity and spin (n, 3, B) by an inverse inertia (1, ...)."""
+    spin = mv(gives.turning, push.turning) + mv(gives.mixed, push.moving)
+    return mv(jnp.swapaxes(gives.mixed, 1, 2), push.turning) + mv(gives.moving, push.moving), spin
+
+
+def _admittance(gives: Inertia, arm: Array) -> Array:
+    """(n, 3, 3, B) velocity of the points at arms per impulse there, by an inverse inertia (1, ...)."""
+    across = gives.mixed + cross_rows(gives.turning, arm)
+    return gives.moving + cross_rows(jnp.swapaxes(gives.mixed, 1, 2), arm) - cross_columns(arm, across)
