@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import _thread
 import errno
 import io
 import json as text
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from typing import Any, NoReturn, TextIO
 
+import jax
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -33,7 +36,7 @@ def run(task: Callable[..., None] | dict[str, Callable[..., None]], arguments: l
     A command outlives who reads its output: see `Stream`.
     """
     out, err = Stream(sys.stdout), Stream(sys.stderr)
-    with redirect_stdout(out), redirect_stderr(err):  # type: ignore[type-var]
+    with redirect_stdout(out), redirect_stderr(err), _interruptible():  # type: ignore[type-var]
         try:
             if isinstance(task, dict):
                 tyro.extras.subcommand_cli_from_dict(task, args=arguments)
@@ -45,6 +48,10 @@ def run(task: Callable[..., None] | dict[str, Callable[..., None]], arguments: l
             _end(1, str(error))
         except KeyboardInterrupt:
             _end(130, "interrupted")
+        except jax.errors.JaxRuntimeError as error:
+            if "KeyboardInterrupt" not in str(error):  # raised where a compiled program called back
+                raise
+            _end(130, "interrupted")
         except OSError as error:
             if error.errno not in DISK:
                 raise
@@ -52,6 +59,24 @@ def run(task: Callable[..., None] | dict[str, Callable[..., None]], arguments: l
         out.flush()
         if out.failure is not None and not isinstance(out.failure, BrokenPipeError):
             _end(1, f"stdout cannot be written: {out.failure.strerror}")
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Raise Ctrl-C again where it came while JAX collected garbage: exceptions raised there are dropped."""
+    before = sys.unraisablehook
+
+    def hook(dropped: sys.UnraisableHookArgs) -> None:
+        if issubclass(dropped.exc_type, KeyboardInterrupt):
+            threading.Timer(0.01, _thread.interrupt_main).start()
+        else:
+            before(dropped)
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
 
 
 def _end(code: int, reason: str) -> NoReturn:

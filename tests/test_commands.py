@@ -7,11 +7,13 @@ import io
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from importlib.metadata import entry_points, version
 from pathlib import Path
 from typing import TextIO
 
+import jax
 import numpy as np
 import pytest
 
@@ -154,3 +156,31 @@ def test_what_cannot_be_written_is_named_and_what_was_there_stays(tmp_path: Path
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert full.value.filename == str(path) and full.value.errno == errno.EFBIG
     assert [each.name for each in tmp_path.iterdir()] == ["kick.npz"] and path.read_bytes() == b"before"
+
+
+def test_ctrl_c_in_a_program_that_calls_back_ends_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted(x: np.ndarray) -> np.ndarray:
+        raise KeyboardInterrupt
+
+    def task() -> None:
+        shape = jax.ShapeDtypeStruct((), np.float32)
+        jax.jit(lambda x: jax.pure_callback(interrupted, shape, x))(np.float32(1.0)).block_until_ready()
+
+    with pytest.raises(SystemExit) as ended:
+        run(task, [])
+    assert ended.value.code == 130 and capsys.readouterr().err.endswith("error: interrupted\n")
+
+
+def test_ctrl_c_while_garbage_is_collected_is_not_lost(capsys: pytest.CaptureFixture[str]) -> None:
+    class Garbage:
+        def __del__(self) -> None:
+            raise KeyboardInterrupt
+
+    def task() -> None:
+        Garbage()
+        time.sleep(5.0)
+        raise AssertionError("it went on")
+
+    with pytest.raises(SystemExit) as ended:
+        run(task, [])
+    assert ended.value.code == 130 and capsys.readouterr().err == "error: interrupted\n"
