@@ -6,6 +6,7 @@ import _thread
 import errno
 import io
 import json as text
+import logging
 import os
 import sys
 import threading
@@ -63,8 +64,11 @@ def run(task: Callable[..., None] | dict[str, Callable[..., None]], arguments: l
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """Raise Ctrl-C again where it came while JAX collected garbage: exceptions raised there are dropped."""
-    before = sys.unraisablehook
+    """Raise Ctrl-C again where it came while JAX collected garbage: exceptions raised there are dropped.
+
+    Where it came in a callback of a compiled program, JAX logs its traceback; not here.
+    """
+    before, logger = sys.unraisablehook, logging.getLogger("jax._src.callback")
 
     def hook(dropped: sys.UnraisableHookArgs) -> None:
         if issubclass(dropped.exc_type, KeyboardInterrupt):
@@ -72,11 +76,16 @@ def _interruptible() -> Iterator[None]:
         else:
             before(dropped)
 
+    def unless_interrupted(record: logging.LogRecord) -> bool:
+        return not (record.exc_info and isinstance(record.exc_info[1], KeyboardInterrupt))
+
     sys.unraisablehook = hook
+    logger.addFilter(unless_interrupted)
     try:
         yield
     finally:
         sys.unraisablehook = before
+        logger.removeFilter(unless_interrupted)
 
 
 def _end(code: int, reason: str) -> NoReturn:
