@@ -30,6 +30,7 @@ ORDER = [
     "larp_model.compliance",
     "larp_model.meeting",
     "larp_model.mechanics",
+    "larp_model.physics.articulated",
     "larp_model.physics.contact",
     "larp_model.physics",
     "larp_model.networks",

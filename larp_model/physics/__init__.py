@@ -1,1 +1,1 @@
-"""Physics that needs no learning: see `contact`."""
+"""Physics that needs no learning: see `articulated` and `contact`."""

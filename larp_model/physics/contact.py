@@ -29,34 +29,24 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model import state as packed
-from larp_model.compliance import moments
 from larp_model.contact import IMPEDANCE, Axis, nearest
 from larp_model.errors import InputError
-from larp_model.kinematics import strength
 from larp_model.mechanics import (
-    Anchors,
     Ends,
     Inertia,
-    Level,
     Push,
     cross,
     cross_columns,
     cross_rows,
     held,
-    inertias,
     inverse,
-    local_anchors,
     mm,
     mv,
     responses,
-    servos,
     solve,
-    tree,
     turn,
-    turned_anchors,
-    turns,
 )
+from larp_model.physics.articulated import Ball, Free, moved_on
 from larp_model.scene import Body, Scene, Surface
 from larp_model.vector import Vector
 
@@ -164,7 +154,7 @@ def step(
     velocity, spin = solve(free.inertia, pushed, free.levels)
     on_ball = _sum(ball.push, _push(touching.floor.arm, on_floor), _total(_push(touching.ball_arm, between)))
     ball_velocity, ball_spin = _moved(inverse(ball.inertia), on_ball)
-    moved = _moved_on(body, free, velocity, spin, h)
+    moved = moved_on(body, free, velocity, spin, h)
     rolled = ball.place + h * ball_velocity, turn(ball.orientation, h * ball_spin), ball_velocity, ball_spin
     after = jnp.concatenate([jnp.concatenate(each, axis=1) for each in (moved, rolled)])
     return jnp.moveaxis(after, -1, 0)
@@ -176,87 +166,6 @@ def require_supported(scene: Scene) -> None:
     if kinds != [False, True] or len(scene.pairs) != 1 or scene.pairs[0].of_itself:
         names = ", ".join(body.kind for body in scene.bodies)
         raise InputError(f"scene has {names}, but needs an articulated body, a ball, and their pair alone")
-
-
-class Free(NamedTuple):
-    """The articulated body within a step, without contacts, in the frames of the step's beginning.
-
-    place, orientation, velocity, spin: at the beginning. tied: from links' centres to their joints. inertia, push:
-    what is known of the links. levels, undamped: the joints, with and without damping. carried (n - 1, 3, B) [rad/s]:
-    what the relative spin gains as its frame turns. drift, drift_turning: what links gain [m/s, rad/s] where neither
-    root nor joints accelerate. matrices: rotations.
-    """
-
-    place: Array
-    orientation: Array
-    velocity: Array
-    spin: Array
-    matrices: Array
-    tied: Anchors
-    inertia: Inertia
-    push: Push
-    levels: list[Level]
-    undamped: list[Level]
-    carried: Array
-    drift: Array
-    drift_turning: Array
-
-    @staticmethod
-    def of(body: Body, state: Array, targets: Array, outside: Array, sizes: Array, gravity: float, h: float) -> Free:
-        """Of a body in states (n, 13, B) under joint targets (j, 3, B) [rad] and torques (n, 3, B) [N m]."""
-        place, orientation, velocity, spin = _columns(state)
-        matrices, parents = turns(orientation), np.array([joint.parent for joint in body.joints], int)
-        inertia = inertias(body, matrices, sizes)
-        momentum = mv(inertia.turning, spin)
-        falling = velocity + h * jnp.array([0.0, 0.0, -gravity], state.dtype)[:, None]
-        push = Push(momentum + h * (outside - cross(spin, momentum)), sizes[:, 2:3] * falling)
-        stronger = strength(body, jnp.moveaxis(sizes, -1, 0))
-        tied = turned_anchors(body, local_anchors(body, sizes), matrices)
-        # How the two points of a joint accelerate apart as their links turn.
-        closing = h * (
-            cross(spin[parents], cross(spin[parents], tied.parent)) - cross(spin[1:], cross(spin[1:], tied.child))
-        )
-        # Armature and damping act on the relative spin as the child sees it.
-        relative = spin[1:] - spin[parents]
-        carried = h * cross(spin[1:], relative)
-        armature, damping = _resistances(body, stronger)
-        pull, _ = servos(body, orientation, matrices, targets, spin, h, stronger)
-        pull = pull + (armature + h * damping) * carried
-        unit = jnp.broadcast_to(jnp.eye(3, dtype=state.dtype)[..., None], (*relative.shape[:2], *relative.shape[1:]))
-
-        def levels(pull: Array, hold: Array) -> list[Level]:
-            given = *tied, closing, pull, hold[:, :, None] * unit
-            return [Level(rows, above, *(each[rows - 1] for each in given)) for rows, above in tree(body)]
-
-        drift = _velocity_products(body, tied, closing, carried)
-        damped = levels(pull, armature + h * damping)
-        undamped = levels(pull - h * damping * (relative + carried), armature)
-        return Free(
-            place, orientation, velocity, spin, matrices, tied, inertia, push, damped, undamped, carried, *drift
-        )  # fmt: skip
-
-
-class Ball(NamedTuple):
-    """The ball within a step, without contacts."""
-
-    place: Array
-    orientation: Array
-    velocity: Array
-    spin: Array
-    radius: Array
-    inertia: Inertia
-    push: Push
-
-    @staticmethod
-    def of(state: Array, outside: Array, sizes: Array, gravity: float, h: float) -> Ball:
-        """Of a ball in states (1, 13, B) under torques (1, 3, B) [N m]."""
-        place, orientation, velocity, spin = _columns(state)
-        turning, mass = moments(*(sizes[:, column] for column in range(3)))[0][:, None], sizes[:, 2:3]
-        unit = jnp.broadcast_to(jnp.eye(3, dtype=state.dtype)[..., None], (1, 3, *spin.shape[1:]))
-        falling = velocity + h * jnp.array([0.0, 0.0, -gravity], state.dtype)[:, None]
-        inertia = Inertia(turning[:, :, None] * unit, jnp.zeros_like(unit), mass[:, :, None] * unit)
-        push = Push(turning * spin + h * outside, mass * falling)
-        return Ball(place, orientation, velocity, spin, sizes[:, 1:2], inertia, push)
 
 
 class Touching(NamedTuple):
@@ -396,47 +305,6 @@ def _line_search(
     return jnp.where(slope(whole) <= 0.0, whole, 0.5 * (low + high))
 
 
-def _velocity_products(body: Body, tied: Anchors, closing: Array, carried: Array) -> tuple[Array, Array]:
-    """What links gain within a step, (n, 3, B) [m/s] and [rad/s], where neither root nor joints accelerate.
-
-    closing, carried: what a joint's points, and the relative spin, gain in the frames of the world.
-    """
-    velocity = spin = jnp.zeros_like(closing[:1])
-    rows = np.array([0])
-    for level, above in tree(body):
-        known, joint = _places(rows, above), level - 1
-        turning = spin[known] + carried[joint]
-        carries = velocity[known] + cross(spin[known], tied.parent[joint])
-        moving = carries - cross(turning, tied.child[joint]) + closing[joint]
-        velocity, spin = jnp.concatenate([velocity, moving]), jnp.concatenate([spin, turning])
-        rows = np.concatenate([rows, level])
-    order = np.argsort(rows)
-    return velocity[order], spin[order]
-
-
-def _moved_on(body: Body, free: Free, velocity: Array, spin: Array, h: float) -> tuple[Array, Array, Array, Array]:
-    """Place, orientation, velocity and spin of all links `h` later, their joints closed.
-
-    velocity, spin: at the end, in the frames of the beginning. As in the engine, root and joints go on with their new
-    velocities, each seen from its own frame, and links follow from the root outwards.
-    """
-    relative = spin[1:] - spin[np.array([joint.parent for joint in body.joints], int)] - free.carried
-    rows, turned = np.array([0]), _turned(h * spin[:1])
-    places, speeds, spins = free.place[:1] + h * velocity[:1], velocity[:1], spin[:1]
-    for level, above in tree(body):
-        known, joint = _places(rows, above), level - 1
-        before = turns(turned[known])
-        after = _times(turned[known], _turned(h * relative[joint]))
-        near, far = mv(before, free.tied.parent[joint]), mv(turns(after), free.tied.child[joint])
-        turning = spins[known] + mv(before, relative[joint])
-        moving = speeds[known] + cross(spins[known], near) - cross(turning, far)
-        places = jnp.concatenate([places, places[known] + near - far])
-        speeds, spins = jnp.concatenate([speeds, moving]), jnp.concatenate([spins, turning])
-        turned, rows = jnp.concatenate([turned, after]), np.concatenate([rows, level])
-    order = np.argsort(rows)
-    return places[order], _times(turned[order], free.orientation), speeds[order], spins[order]
-
-
 def _closest(
     body: Body, rows: np.ndarray, free: Free, ball: Ball, sizes: Array
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
@@ -451,41 +319,8 @@ def _closest(
     return points - centre, points - ball.place, normals, gap[:, None]
 
 
-def _resistances(body: Body, stronger: Array) -> tuple[Array, Array]:
-    """Armature [kg m^2] and damping [N m s/rad] of the joints, (n - 1, 1, B or 1) each."""
-    motors = [joint.motor for joint in body.joints]
-    armature = jnp.array([[motor.armature if motor else 0.0] for motor in motors])[..., None] * stronger
-    damping = jnp.array([[motor.damping if motor else 0.0] for motor in motors])[..., None] * stronger
-    return armature, damping + jnp.array([[0.0 if joint.motor else joint.damping] for joint in body.joints])[..., None]
-
-
-def _columns(state: Array) -> tuple[Array, Array, Array, Array]:
-    """Position, orientation, velocity and spin of states (n, 13, B)."""
-    place, orientation, velocity, spin = (
-        state[:, columns] for columns in (packed.POSITION, packed.ORIENTATION, packed.VELOCITY, packed.ANGULAR_VELOCITY)
-    )
-    return place, orientation, velocity, spin
-
-
-def _places(rows: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    return np.array([int(np.flatnonzero(rows == row)[0]) for row in wanted])
-
-
 def _vector(vectors: Array) -> Vector:
     return Vector(vectors[:, 0], vectors[:, 1], vectors[:, 2])
-
-
-def _turned(rotation_vector: Array) -> Array:
-    """Quaternions (n, 4, B) of small rotation vectors (n, 3, B) [rad]."""
-    still = jnp.zeros_like(rotation_vector[:, :1])
-    return turn(jnp.concatenate([still + 1.0, still, still, still], axis=1), rotation_vector)
-
-
-def _times(first: Array, second: Array) -> Array:
-    """Products of quaternions (n, 4, B)."""
-    a, u, b, v = first[:, :1], first[:, 1:], second[:, :1], second[:, 1:]
-    product = jnp.concatenate([a * b - jnp.sum(u * v, axis=1, keepdims=True), a * v + b * u + cross(u, v)], axis=1)
-    return product * jax.lax.rsqrt(jnp.sum(product**2, axis=1, keepdims=True))
 
 
 def _inertia(arm: Array, mass: Array) -> Inertia:
