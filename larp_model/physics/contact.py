@@ -50,7 +50,7 @@ from larp_model.physics.articulated import Ball, Free, moved_on
 from larp_model.scene import Body, Scene, Surface
 from larp_model.vector import Vector
 
-Velocities = tuple[Array, Array, Array, Array]
+AllVelocities = tuple[Array, Array, Array, Array]
 """[m/s] and [rad/s] of the links (n, 3, B), and of the ball (1, 3, B)."""
 
 AtContacts = tuple[Array, Array, Array]
@@ -204,7 +204,7 @@ class Touching(NamedTuple):
         drift = free.drift[rows] + cross(free.drift_turning[rows], arm)
         return Touching(ends, floor, hit._replace(reference=hit.reference - drift), ball_arm, rows)
 
-    def velocities(self, moving: Velocities) -> AtContacts:
+    def velocities(self, moving: AllVelocities) -> AtContacts:
         """Relative velocities [m/s] at all contacts."""
         velocity, spin, ball_velocity, ball_spin = moving
         at_ends = jnp.concatenate([velocity, velocity]) + cross(jnp.concatenate([spin, spin]), self.ends.arm)
@@ -212,7 +212,7 @@ class Touching(NamedTuple):
         return at_ends, ball_velocity + cross(ball_spin, self.floor.arm), on_ball - self.of_links(velocity, spin)
 
     def of_links(self, velocity: Array, spin: Array) -> Array:
-        """Velocities [m/s] of links where they touch the ball."""
+        """AllVelocities [m/s] of links where they touch the ball."""
         return velocity[self.rows] + cross(spin[self.rows], self.links.arm)
 
     @property
@@ -224,13 +224,13 @@ class Touching(NamedTuple):
 def impulses_of(free: Free, ball: Ball, touching: Touching, iterations: int) -> AtContacts:
     """The impulses [N s] of all contacts, by Newton's method; see the module."""
 
-    def newton(found: tuple[Velocities, AtContacts], first: Array) -> tuple[tuple[Velocities, AtContacts], None]:
+    def newton(found: tuple[AllVelocities, AtContacts], first: Array) -> tuple[tuple[AllVelocities, AtContacts], None]:
         moving, impulses = found
         new_moving, new_impulses = _newton_step(free, ball, touching, moving)
         before, after = touching.velocities(moving), touching.velocities(new_moving)
         share = _line_search(touching.kinds, before, after, impulses, new_impulses)
         share = jnp.where(first, 1.0, share)  # velocities at the beginning are no solution for any impulses
-        mixed: tuple[Velocities, AtContacts] = jax.tree.map(
+        mixed: tuple[AllVelocities, AtContacts] = jax.tree.map(
             lambda old, new: old + share * (new - old), found, (new_moving, new_impulses)
         )
         return mixed, None
@@ -241,8 +241,8 @@ def impulses_of(free: Free, ball: Ball, touching: Touching, iterations: int) -> 
     return impulses
 
 
-def _newton_step(free: Free, ball: Ball, touching: Touching, guess: Velocities) -> tuple[Velocities, AtContacts]:
-    """Velocities and impulses where all contacts are linear around a guess."""
+def _newton_step(free: Free, ball: Ball, touching: Touching, guess: AllVelocities) -> tuple[AllVelocities, AtContacts]:
+    """AllVelocities and impulses where all contacts are linear around a guess."""
     at_ends, at_floor, between = touching.velocities(guess)
     before, arm = touching.of_links(*guess[:2]), touching.ball_arm
     end_mass, end_push = touching.ends.linear(at_ends)
