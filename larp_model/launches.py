@@ -54,7 +54,7 @@ class Launches(NamedTuple):
 
     @property
     def kinds(self) -> dict[str, np.ndarray]:
-        """Which of the launches (N,) are of a kind, by its name; those that no launch is of are left out."""
+        """Return a mask (N,) of the launches of every kind, by its name; empty kinds are left out."""
         slow, medium, fast = SPEEDS
         several, groups = self.by.sum(axis=1) > 1, [_without_side(link) for link in self.links]
         alone = {
@@ -81,13 +81,13 @@ class Launches(NamedTuple):
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Count and quantiles of both errors, of all launches and, under `kinds`, of every kind."""
+        """Return count and quantiles of both errors, of all launches and, under `kinds`, of every kind."""
         return self.figures(np.ones(len(self.error), bool)) | {
             "kinds": {name: self.figures(which) for name, which in self.kinds.items()}
         }
 
     def figures(self, which: np.ndarray) -> dict[str, Any]:
-        """Count and quantiles of both errors of some launches (N,)."""
+        """Return count and quantiles of both errors of the launches in a mask (N,)."""
         if not which.any():
             return {"count": 0}
         return {
@@ -98,7 +98,7 @@ class Launches(NamedTuple):
 
 
 def launches_of(simulator: Simulator, episodes: Trajectories, before: int) -> Launches:
-    """Launches of episodes, predicted from the true states `before` steps ahead of first contact."""
+    """Return the launches of episodes, predicted from the true states `before` steps ahead of first contact."""
     scene, row = simulator.scene, struck(simulator.scene)
     if row is None:
         raise InputError("simulator.scene has no body of one link that another can strike")
@@ -132,7 +132,7 @@ def launches_of(simulator: Simulator, episodes: Trajectories, before: int) -> La
 
 
 def struck(scene: Scene) -> int | None:
-    """The row of the ball; None where the scene has none: see the module."""
+    """Return the row of the ball; None where the scene has none: see the module."""
     for pair in scene.between.pairs[:1]:
         if len(scene.body(pair.second).links) == 1:
             return scene.index(pair.second, pair.second_links[0])
@@ -140,14 +140,14 @@ def struck(scene: Scene) -> int | None:
 
 
 def quantiles(values: np.ndarray) -> dict[str, float]:
-    """Median, 75th and 90th percentile; of values that may be infinite, none is taken between two."""
+    """Return median, 75th and 90th percentile; of values that may be infinite, none is taken between two."""
     method: Literal["linear", "higher"] = "linear" if np.isfinite(values).all() else "higher"
     levels = {"median": 0.5, "p75": 0.75, "p90": 0.9}
     return {name: float(np.quantile(values, level, method=method)) for name, level in levels.items()}
 
 
 def _touched(scene: Scene, states: np.ndarray, morphology: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Which links push the ball in which steps of true states (N, T + 1, L, 13): (N, T, P), and their names."""
+    """Return masks (N, T, P) of links that push the ball in steps of states (N, T + 1, L, 13), and their names."""
     count, steps = len(states), states.shape[1] - 1
     before, after = (states[:, ends].reshape(-1, *states.shape[2:]) for ends in (slice(-1), slice(1, None)))
     sizes, parts = np.repeat(morphology, steps, axis=0), []
@@ -160,7 +160,7 @@ def _touched(scene: Scene, states: np.ndarray, morphology: np.ndarray) -> tuple[
 
 @partial(jax.jit, static_argnums=0)
 def _pushes(scene: Scene, before: Array, after: Array, morphology: Array) -> Array:
-    """(B, P) which links touch the ball, and push it, between states (B, L, 13)."""
+    """Return a mask (B, P) of the links that touch the ball, and push it, between states (B, L, 13)."""
     alone = replace(scene, pairs=scene.between.pairs[:1])
     ((pair, meeting),) = meetings(alone, before, morphology, after)
     ball = scene.index(pair.second, pair.second_links[0])

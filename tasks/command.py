@@ -128,7 +128,7 @@ class Stream(io.TextIOBase):
         self._try(self._stream.flush)
 
     def isatty(self) -> bool:
-        """Whether a person reads along."""
+        """Return True where the stream is a terminal."""
         return self._stream.isatty()
 
     def fileno(self) -> int:

@@ -30,7 +30,7 @@ def nothing_is_set() -> Iterator[None]:
 
 
 def folder() -> str | None:
-    """Where JAX keeps what it compiles."""
+    """Return the folder of JAX's compilation cache."""
     return jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
 
 

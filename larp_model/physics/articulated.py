@@ -59,7 +59,7 @@ class Free(NamedTuple):
 
     @staticmethod
     def of(body: Body, state: Array, targets: Array, outside: Array, sizes: Array, gravity: float, h: float) -> Free:
-        """Of a body in states (n, 13, B) under joint targets (j, 3, B) [rad] and torques (n, 3, B) [N m]."""
+        """Return the step of a body in states (n, 13, B), by joint targets (j, 3, B) [rad], torques (n, 3, B) [N m]."""
         place, orientation, velocity, spin = _columns(state)
         matrices, parents = turns(orientation), np.array([joint.parent for joint in body.joints], int)
         inertia = inertias(body, matrices, sizes)
@@ -105,7 +105,7 @@ class Ball(NamedTuple):
 
     @staticmethod
     def of(state: Array, outside: Array, sizes: Array, gravity: float, h: float) -> Ball:
-        """Of a ball in states (1, 13, B) under torques (1, 3, B) [N m]."""
+        """Return the step of a ball in states (1, 13, B) under torques (1, 3, B) [N m]."""
         place, orientation, velocity, spin = _columns(state)
         turning, mass = moments(*(sizes[:, column] for column in range(3)))[0][:, None], sizes[:, 2:3]
         unit = jnp.broadcast_to(jnp.eye(3, dtype=state.dtype)[..., None], (1, 3, *spin.shape[1:]))
@@ -116,7 +116,7 @@ class Ball(NamedTuple):
 
 
 def _velocity_products(body: Body, tied: Anchors, closing: Array, carried: Array) -> tuple[Array, Array]:
-    """What links gain within a step, (n, 3, B) [m/s] and [rad/s], where neither root nor joints accelerate.
+    """Return the velocity products: gains (n, 3, B) [m/s] and [rad/s] of links whose root and joints do not accelerate.
 
     closing, carried: what a joint's points, and the relative spin, gain in the frames of the world.
     """
@@ -134,7 +134,7 @@ def _velocity_products(body: Body, tied: Anchors, closing: Array, carried: Array
 
 
 def moved_on(body: Body, free: Free, velocity: Array, spin: Array, h: float) -> tuple[Array, Array, Array, Array]:
-    """Place, orientation, velocity and spin of all links `h` later, their joints closed.
+    """Return place, orientation, velocity and spin of all links `h` later, their joints closed.
 
     velocity, spin: at the end, in the frames of the beginning. As in the engine, root and joints go on with their new
     velocities, each seen from its own frame, and links follow from the root outwards.
@@ -157,7 +157,7 @@ def moved_on(body: Body, free: Free, velocity: Array, spin: Array, h: float) -> 
 
 
 def _resistances(body: Body, stronger: Array) -> tuple[Array, Array]:
-    """Armature [kg m^2] and damping [N m s/rad] of the joints, (n - 1, 1, B or 1) each."""
+    """Return armature [kg m^2] and damping [N m s/rad] of the joints, (n - 1, 1, B or 1) each."""
     motors = [joint.motor for joint in body.joints]
     armature = jnp.array([[motor.armature if motor else 0.0] for motor in motors])[..., None] * stronger
     damping = jnp.array([[motor.damping if motor else 0.0] for motor in motors])[..., None] * stronger
@@ -165,7 +165,7 @@ def _resistances(body: Body, stronger: Array) -> tuple[Array, Array]:
 
 
 def _columns(state: Array) -> tuple[Array, Array, Array, Array]:
-    """Position, orientation, velocity and spin of states (n, 13, B)."""
+    """Return position, orientation, velocity and spin of states (n, 13, B)."""
     place, orientation, velocity, spin = (
         state[:, columns] for columns in (packed.POSITION, packed.ORIENTATION, packed.VELOCITY, packed.ANGULAR_VELOCITY)
     )
@@ -177,13 +177,13 @@ def _places(rows: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 
 
 def _turned(rotation_vector: Array) -> Array:
-    """Quaternions (n, 4, B) of small rotation vectors (n, 3, B) [rad]."""
+    """Return quaternions (n, 4, B) of small rotation vectors (n, 3, B) [rad]."""
     still = jnp.zeros_like(rotation_vector[:, :1])
     return turn(jnp.concatenate([still + 1.0, still, still, still], axis=1), rotation_vector)
 
 
 def _times(first: Array, second: Array) -> Array:
-    """Products of quaternions (n, 4, B)."""
+    """Return products of quaternions (n, 4, B)."""
     a, u, b, v = first[:, :1], first[:, 1:], second[:, :1], second[:, 1:]
     product = jnp.concatenate([a * b - jnp.sum(u * v, axis=1, keepdims=True), a * v + b * u + cross(u, v)], axis=1)
     return product * jax.lax.rsqrt(jnp.sum(product**2, axis=1, keepdims=True))

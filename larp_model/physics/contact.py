@@ -54,7 +54,7 @@ AllVelocities = tuple[Array, Array, Array, Array]
 """[m/s] and [rad/s] of the links (n, 3, B), and of the ball (1, 3, B)."""
 
 AtContacts = tuple[Array, Array, Array]
-"""Of the contacts of links with the ground, of the ball with the ground, of links with the ball, (n, 3, B) each."""
+"""Vectors (n, 3, B) at the contacts of links with the ground, of the ball with the ground, of links with the ball."""
 
 Tree = TypeVar("Tree", Inertia, Push)
 
@@ -80,25 +80,25 @@ class Contacts(NamedTuple):
     def of(
         surface: Surface, arm: Array, normal: Array, velocity: Array, gap: Array, inverse_weight: Array, h: float
     ) -> Contacts:
-        """Contacts of relative velocity (n, 3, B) [m/s], gap (n, 1, B) [m] and inverse weight (n, 1, B or 1) [1/kg]."""
+        """Return contacts of velocity (n, 3, B) [m/s], gap (n, 1, B) [m] and inverse weight (n, 1, B or 1) [1/kg]."""
         slowed = velocity * (1.0 - h * surface.damping / IMPEDANCE)
         reference = slowed - h * surface.stiffness / IMPEDANCE * gap * normal
         mass = IMPEDANCE / ((1.0 - IMPEDANCE) * inverse_weight)
         return Contacts(arm, normal, reference, mass, held((gap < 0.0).astype(gap.dtype)), surface.friction)
 
     def impulse(self, velocity: Array) -> Array:
-        """J (n, 3, B) [N s] at velocities u' (n, 3, B)."""
+        """Return J (n, 3, B) [N s] at velocities u' (n, 3, B)."""
         return self.active * projection(self.mass * (self.reference - velocity), self.normal, self.friction)[0]
 
     def linear(self, velocity: Array) -> tuple[Array, Array]:
-        """M (n, 3, 3, B) [kg] and q (n, 3, B) [N s] of J = q - M u', around velocities u' (n, 3, B)."""
+        """Return M (n, 3, 3, B) [kg] and q (n, 3, B) [N s] of J = q - M u', around velocities u' (n, 3, B)."""
         impulse, slope = projection(self.mass * (self.reference - velocity), self.normal, self.friction)
         mass = held((self.active * self.mass)[:, None] * slope)
         return mass, self.active * impulse + mv(mass, velocity)
 
 
 def projection(wanted: Array, normal: Array, friction: float) -> tuple[Array, Array]:
-    """The points (n, 3, B) of the friction cone that are nearest to those wanted, and the slopes (n, 3, 3, B)."""
+    """Return the points (n, 3, B) of the friction cone nearest to those wanted, and the slopes (n, 3, 3, B)."""
     unit = jnp.eye(3, dtype=wanted.dtype)[..., None]
     along = jnp.sum(wanted * normal, axis=1, keepdims=True)
     tangent = wanted - along * normal
@@ -116,7 +116,7 @@ def projection(wanted: Array, normal: Array, friction: float) -> tuple[Array, Ar
 
 
 def inverse_weights(scene: Scene, morphology: Array) -> Array:
-    """(L, B or 1) [1/kg] mean velocity gained by a link's centre per impulse there, in the reference pose.
+    """Return (L, B or 1) [1/kg] the mean velocity gained by a link's centre per impulse there, in the reference pose.
 
     MuJoCo's constant approximation, `body_invweight0`, by which R is set. morphology (B or 1, L, 3).
     """
@@ -133,7 +133,7 @@ def step(
     scene: Scene, state: Array, control: Array, torque: Array, morphology: Array, weights: Array, h: float,
     iterations: int = 6,
 ) -> Array:  # fmt: skip
-    """States (B, L, 13) `h` [s] after states (B, L, 13), as MuJoCo's semi-implicit Euler rule has them.
+    """Return states (B, L, 13) `h` [s] after states (B, L, 13), as MuJoCo's semi-implicit Euler rule has them.
 
     scene: an articulated body, and a ball that it may touch. control (B, J, 3) [rad], torque (B, L, 3) [N m],
     morphology (B or 1, L, 3). weights: see `inverse_weights`. Damping is implicit; contact forces are found with
@@ -182,7 +182,7 @@ class Touching(NamedTuple):
 
     @staticmethod
     def of(scene: Scene, free: Free, ball: Ball, sizes: Array, weight: Array, h: float) -> Touching:
-        """Contacts of a body and a ball, of sizes (L, 3, B) and inverse weights (L, 1, B or 1) [1/kg]."""
+        """Return the contacts of a body and a ball, of sizes (L, 3, B) and inverse weights (L, 1, B or 1) [1/kg]."""
         (body, sphere), (pair,), links = scene.bodies, scene.pairs, len(scene.bodies[0].links)
         up = jnp.array([0.0, 0.0, 1.0], free.place.dtype)[None, :, None]
         found = Ends.of(body, free.matrices, free.place[:, 2:], free.velocity, free.spin, sizes[:links], h)
@@ -205,14 +205,14 @@ class Touching(NamedTuple):
         return Touching(ends, floor, hit._replace(reference=hit.reference - drift), ball_arm, rows)
 
     def velocities(self, moving: AllVelocities) -> AtContacts:
-        """Relative velocities [m/s] at all contacts."""
+        """Return relative velocities [m/s] at all contacts."""
         velocity, spin, ball_velocity, ball_spin = moving
         at_ends = jnp.concatenate([velocity, velocity]) + cross(jnp.concatenate([spin, spin]), self.ends.arm)
         on_ball = ball_velocity + cross(ball_spin, self.ball_arm)
         return at_ends, ball_velocity + cross(ball_spin, self.floor.arm), on_ball - self.of_links(velocity, spin)
 
     def of_links(self, velocity: Array, spin: Array) -> Array:
-        """AllVelocities [m/s] of links where they touch the ball."""
+        """Return velocities [m/s] of links where they touch the ball."""
         return velocity[self.rows] + cross(spin[self.rows], self.links.arm)
 
     @property
@@ -222,7 +222,7 @@ class Touching(NamedTuple):
 
 
 def impulses_of(free: Free, ball: Ball, touching: Touching, iterations: int) -> AtContacts:
-    """The impulses [N s] of all contacts, by Newton's method; see the module."""
+    """Return the impulses [N s] of all contacts, by Newton's method; see the module."""
 
     def newton(found: tuple[AllVelocities, AtContacts], first: Array) -> tuple[tuple[AllVelocities, AtContacts], None]:
         moving, impulses = found
@@ -242,7 +242,7 @@ def impulses_of(free: Free, ball: Ball, touching: Touching, iterations: int) -> 
 
 
 def _newton_step(free: Free, ball: Ball, touching: Touching, guess: AllVelocities) -> tuple[AllVelocities, AtContacts]:
-    """AllVelocities and impulses where all contacts are linear around a guess."""
+    """Return velocities and impulses where all contacts are linear around a guess."""
     at_ends, at_floor, between = touching.velocities(guess)
     before, arm = touching.of_links(*guess[:2]), touching.ball_arm
     end_mass, end_push = touching.ends.linear(at_ends)
@@ -279,7 +279,7 @@ def _newton_step(free: Free, ball: Ball, touching: Touching, guess: AllVelocitie
 def _line_search(
     kinds: tuple[Contacts, ...], before: AtContacts, after: AtContacts, was: AtContacts, new: AtContacts
 ) -> Array:
-    """Share (B,) of a Newton step that makes the cost of the convex problem least.
+    """Return the share (B,) of a Newton step that makes the cost of the convex problem least.
 
     The cost's slope along the step is that of velocities at the contacts, from `before` to `after`, times what the
     impulses, which the velocities came from, are more than those that the velocities call for.
@@ -308,7 +308,7 @@ def _line_search(
 def _closest(
     body: Body, rows: np.ndarray, free: Free, ball: Ball, sizes: Array
 ) -> tuple[Array, Array, Array, Array]:  # fmt: skip
-    """Of links and the ball: arms to the contact points from both centres, normals (P, 3, B), gaps (P, 1, B) [m]."""
+    """Return arms from links and ball to their contact points, normals (P, 3, B), and gaps (P, 1, B) [m]."""
     axes = jnp.array([body.links[row].axis for row in rows], free.place.dtype)[..., None]
     half, centre = 0.5 * sizes[:, :1] * mv(free.matrices[rows], axes), free.place[rows]
     zero = jnp.zeros_like(centre[:, 0])
@@ -324,7 +324,7 @@ def _vector(vectors: Array) -> Vector:
 
 
 def _inertia(arm: Array, mass: Array) -> Inertia:
-    """Of masses (n, 3, 3, B) at arms (n, 3, B), about where the arms begin."""
+    """Return the inertia of masses (n, 3, 3, B) at arms (n, 3, B), about where the arms begin."""
     mixed = cross_columns(arm, mass)
     return Inertia(-cross_rows(mixed, arm), mixed, mass)
 
@@ -344,24 +344,24 @@ def _total(parts: Tree) -> Tree:
 
 
 def _both_ends(ends: Tree) -> Tree:
-    """Of links (n, ...), from both ends of all of them (2 n, ...)."""
+    """Return the sums (n, ...) over both ends of all links (2 n, ...)."""
     result: Tree = jax.tree.map(lambda each: each[: len(each) // 2] + each[len(each) // 2 :], ends)
     return result
 
 
 def _onto(rows: np.ndarray, links: int, parts: Tree) -> Tree:
-    """Of all links, where those of these rows have parts and the others nothing."""
+    """Return arrays of all links that hold these parts in these rows and zeros elsewhere."""
     result: Tree = jax.tree.map(lambda each: jnp.zeros((links, *each.shape[1:]), each.dtype).at[rows].add(each), parts)
     return result
 
 
 def _moved(gives: Inertia, push: Push) -> tuple[Array, Array]:
-    """Velocity and spin (n, 3, B) by an inverse inertia (1, ...)."""
+    """Return velocity and spin (n, 3, B) by an inverse inertia (1, ...)."""
     spin = mv(gives.turning, push.turning) + mv(gives.mixed, push.moving)
     return mv(jnp.swapaxes(gives.mixed, 1, 2), push.turning) + mv(gives.moving, push.moving), spin
 
 
 def _admittance(gives: Inertia, arm: Array) -> Array:
-    """(n, 3, 3, B) velocity of the points at arms per impulse there, by an inverse inertia (1, ...)."""
+    """Return (n, 3, 3, B) the velocity of the points at arms per impulse there, by an inverse inertia (1, ...)."""
     across = gives.mixed + cross_rows(gives.turning, arm)
     return gives.moving + cross_rows(jnp.swapaxes(gives.mixed, 1, 2), arm) - cross_columns(arm, across)

@@ -119,7 +119,7 @@ class Truth:
         self._bodies = [self.model.body(name).id for name in self._names()]  # the engine lists bodies depth first
 
     def __getstate__(self) -> dict[str, Any]:
-        """What a copy is made of: it begins anew, with the same links, and has to be reset."""
+        """Return the arguments and link sizes from which a copy is made; it begins anew and has to be reset."""
         return {
             "arguments": (self.scene, self.batch, self.substeps, self.threads),
             "morphology": self.morphology,

@@ -141,7 +141,7 @@ def main(
 
 
 def judged(manifest: Path | None, chosen: Scenario, episodes: Episodes) -> dict[str, Any]:
-    """What `evaluation.evaluate` finds of some weights, or of physics alone, and how long a step of them takes."""
+    """Return errors of some weights, or of physics alone (see `evaluation.evaluate`), and the time of a step."""
     if manifest is None:
         model = designs.hybrid(chosen.scene)
         simulator = Simulator(model, stored.untrained(model))

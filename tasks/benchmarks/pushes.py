@@ -400,7 +400,7 @@ def precision(bench: Bench) -> list[Row]:
 
 
 def refusal(call: Callable[[], Any], words: str) -> tuple[str, bool]:
-    """What a call that must be refused says, and whether it is an InputError with these words."""
+    """Return the message of a call that must be refused, and True if it is an InputError with these words."""
     try:
         call()
     except Exception as error:

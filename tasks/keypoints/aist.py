@@ -75,7 +75,7 @@ def video(sequence: str, camera: int) -> str:
 
 
 def load(folder: Path, sequence: str, camera: int) -> Dance:
-    """What one camera, from 0, saw of a sequence; InputError, in one line, says what is missing or damaged.
+    """Return the `Dance` of one camera, from 0, of a sequence; InputError says what is missing or damaged.
 
     Distortion is taken out of the keypoints, so that the camera has none; so is a focal length that differs across.
     """

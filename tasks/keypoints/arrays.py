@@ -49,7 +49,7 @@ class _Unfinished:
 
 
 def load(path: Path) -> Any:
-    """What a pickle of protocol 2 to 5 holds; InputError, in one line, if it is damaged or holds anything else."""
+    """Return the content of a pickle of protocol 2 to 5; InputError if it is damaged or holds anything else."""
     try:
         with warnings.catch_warnings(action="ignore"):  # of odd text in damaged files
             return _followed(path.read_bytes())
