@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from larp_model.anatomy import ANATOMIES, KINDS, Detail, Segment
+from larp_model.anatomy import ANATOMIES, KINDS, BodySegment, Detail
 from larp_model.errors import InputError
 from larp_model.names import require_known
 from larp_model.scene import Body, Joint, Link, Pair, Scene, Surface, Vector
@@ -108,7 +108,7 @@ def _usual_human(name: str, detail: Detail) -> Body:
     ]
     names = [side + segment.name for segment, side in rows]
 
-    def joint(segment: Segment, side: str) -> Joint:
+    def joint(segment: BodySegment, side: str) -> Joint:
         parent = names.index(segment.above if segment.above in names else side + segment.above)
         motor, (sign, at, own) = segment.motor, (1.0, segment.parent_anchor, segment.child_anchor)
         if side == "right_":  # mirroring y turns roll and yaw round

@@ -13,10 +13,9 @@ from typing import Literal
 
 from larp_model.mechanics import Constants
 from larp_model.networks import Size
-from larp_model.parts.articulated import Articulated, Base, Response
+from larp_model.parts.articulated import Articulated, BodyBase, Response
 from larp_model.parts.bases import FromNothing, OverMechanics
-from larp_model.parts.contact import Base as ContactBase
-from larp_model.parts.contact import Contact
+from larp_model.parts.contact import Contact, ContactBase
 from larp_model.parts.impacts import FreeImpact, SoftContacts
 from larp_model.parts.paper import PaperBody, PaperContact
 from larp_model.parts.part import BodyPart, Model, PairPart, ordered
@@ -62,7 +61,9 @@ def hybrid(scene: Scene, sizes: Sizes = SIZES["small"]) -> Model:
     # A body's own links press on each other for longer than an impact: with fading, legs slip further through. What a
     # network learned there was no better than mechanics for the lean human, and worse for the full one.
     between, within = (SoftContacts(Rule(fades=FADES)), sizes.contact), (SoftContacts(), None)
-    return _impulsive(scene, sizes, OverMechanics(Constants(rounds=3), lasting=True), between, within, sliding=True)
+    return _impulsive(
+        scene, sizes, OverMechanics(Constants(rounds=3), lasting=True), between, within, sliding=True
+    )
 
 
 def paper(scene: Scene, sizes: Sizes = PAPER) -> Model:
@@ -82,7 +83,7 @@ _Contacts = tuple[ContactBase, Size | None]
 
 
 def _impulsive(
-    scene: Scene, sizes: Sizes, base: Base, between: _Contacts, within: _Contacts, sliding: bool = False
+    scene: Scene, sizes: Sizes, base: BodyBase, between: _Contacts, within: _Contacts, sliding: bool = False
 ) -> Model:
     """Bodies and contacts that are impulses, on these bases, with networks of these sizes: of two, within one."""
 

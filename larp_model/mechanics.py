@@ -52,7 +52,7 @@ class Constants:
     rounds: int = 0
 
 
-class Motion(NamedTuple):
+class BodyMotion(NamedTuple):
     """What becomes of a body within a step: (B, n, 3) each, world frame.
 
     velocity [m/s] and spin [rad/s] at its end; moved [m] and turned [rad] during it.
@@ -72,7 +72,7 @@ class Inertia(NamedTuple):
     moving: Array
 
 
-class Push(NamedTuple):
+class Momenta(NamedTuple):
     """Momenta (n, 3, B) of turning and of moving."""
 
     turning: Array
@@ -109,7 +109,7 @@ class Level(NamedTuple):
 def free_motion(
     body: Body, state: Array, control: Array, torque: Array, morphology: Array, gravity: float, dt: float,
     constants: Constants = Constants(),
-) -> Motion:  # fmt: skip
+) -> BodyMotion:  # fmt: skip
     """How a body in states (B, n, 13) moves on within `dt` [s] if nothing but the ground touches it.
 
     control (B, j, 3) joint targets [rad], torque (B, n, 3) [N m] from outside, morphology (B or 1, n, 3).
@@ -131,7 +131,7 @@ def free_motion(
         matrices = turns(turn(start, h * spin))
         inertia = inertias(body, matrices, sizes)
         momentum, mass = mv(inertia.turning, spin), sizes[:, 2:3]
-        push = Push(momentum + h * (outside - cross(spin, momentum)), mass * (velocity + h * down))
+        push = Momenta(momentum + h * (outside - cross(spin, momentum)), mass * (velocity + h * down))
         tied = turned_anchors(body, local, matrices)
         before = turns(start)
         pull, hold = servos(body, start, before, targets, spin, h, stronger)
@@ -142,7 +142,7 @@ def free_motion(
             for rows, parents in tree(body)
         ]
 
-        def parting(bearing: tuple[Inertia, Push]) -> tuple[Array, Array]:
+        def parting(bearing: tuple[Inertia, Momenta]) -> tuple[Array, Array]:
             """Velocities and spins under what the ground adds to inertia and push."""
             bears, pushed = held(jax.tree.map(jnp.add, (inertia, push), bearing))
             return solve(bears, pushed, levels)
@@ -176,7 +176,7 @@ def free_motion(
     (velocity1, velocity2), (spin1, spin2) = velocities, spins
     begun = (1.0 - GAMMA) * dt * spin1
     moved = dt * ((1.0 - GAMMA) * velocity1 + GAMMA * velocity2)
-    return Motion(*(jnp.moveaxis(each, -1, 0) for each in (velocity2, spin2, moved, begun + h * spin2)))
+    return BodyMotion(*(jnp.moveaxis(each, -1, 0) for each in (velocity2, spin2, moved, begun + h * spin2)))
 
 
 def impulse_response(
@@ -205,7 +205,7 @@ def impulse_response(
     levels = [
         Level(rows, parents, *(each[rows - 1] for each in (*tied, still, still, hold))) for rows, parents in tree(body)
     ]
-    gained = solve(inertias(body, matrices, sizes), Push(push[:, 3:], push[:, :3]), levels)
+    gained = solve(inertias(body, matrices, sizes), Momenta(push[:, 3:], push[:, :3]), levels)
     velocity, spin = (jnp.moveaxis(each, -1, 0) for each in gained)
     return velocity, spin
 
@@ -254,7 +254,7 @@ def responses(body: Body, rows: np.ndarray, matrices: Array, morphology: Array, 
         Level(links, parents, *(each[links - 1] for each in (*tied, still[1:], still[1:], hold)))
         for links, parents in tree(body)
     ]
-    whole, _, joined = inwards(inertias(body, matrices, sizes), Push(still, still), levels)
+    whole, _, joined = inwards(inertias(body, matrices, sizes), Momenta(still, still), levels)
     gives = {0: inverse(Inertia(*(block[:1] for block in whole)))}
     # A scan over levels, filled up to as many links of each, because as many copies take long to compile.
     needed = _ancestry(body, rows)
@@ -467,8 +467,15 @@ class Ends(NamedTuple):
         return twice(velocity) + cross(twice(spin), self.arm)
 
     def decided(
-        self, body: Body, velocity: Array, spin: Array, gravity: float, h: float, constants: Constants, mass: Array
-    ) -> tuple[Inertia, Push]:
+        self,
+        body: Body,
+        velocity: Array,
+        spin: Array,
+        gravity: float,
+        h: float,
+        constants: Constants,
+        mass: Array,
+    ) -> tuple[Inertia, Momenta]:
         """What they add to their links' inertia and push where each is judged as if its link were free.
 
         Where an end is in the ground, a large share of the body's mass (1, 1, B) [kg] that moves as the ground allows
@@ -489,7 +496,7 @@ class Ends(NamedTuple):
         hold = (mass * bearing)[:, None] * (sticks * constants.standing * unit + (1.0 - sticks) * loosely)
         return self.held_by(hold, mv(hold, self.allowed))
 
-    def found(self, guess: Array, met: Array, firm: Array, friction: float) -> tuple[Inertia, Push]:
+    def found(self, guess: Array, met: Array, firm: Array, friction: float) -> tuple[Inertia, Momenta]:
         """What they add to their links' inertia and push: the ground's impulses, linear around velocities `guess`.
 
         met (2 n, 1, B): 1 where an end is in the ground. firm (1, 1, B) [kg]: see `reaction`.
@@ -498,11 +505,11 @@ class Ends(NamedTuple):
         hold = held(met[:, None] * firm[:, None] * slope)
         return self.held_by(hold, met * impulse + mv(hold, guess))
 
-    def held_by(self, hold: Array, push: Array) -> tuple[Inertia, Push]:
+    def held_by(self, hold: Array, push: Array) -> tuple[Inertia, Momenta]:
         """Inertia and push of the links whose ends masses (2 n, 3, 3, B) [kg] hold and momenta (2 n, 3, B) push."""
         mixed, links = cross_columns(self.arm, hold), len(self.arm) // 2
-        added = Inertia(-cross_rows(mixed, self.arm), mixed, hold), Push(cross(self.arm, push), push)
-        both: tuple[Inertia, Push] = jax.tree.map(lambda each: each[:links] + each[links:], added)
+        added = Inertia(-cross_rows(mixed, self.arm), mixed, hold), Momenta(cross(self.arm, push), push)
+        both: tuple[Inertia, Momenta] = jax.tree.map(lambda each: each[:links] + each[links:], added)
         return both
 
 
@@ -559,13 +566,13 @@ class Joined(NamedTuple):
     factor: Array
 
 
-def inwards(inertia: Inertia, push: Push, levels: list[Level]) -> tuple[Inertia, Push, list[Joined]]:
+def inwards(inertia: Inertia, push: Momenta, levels: list[Level]) -> tuple[Inertia, Momenta, list[Joined]]:
     """Inertia and push of the root with all that hangs on it, and the joints of the levels."""
     passed = []
     for level in reversed(levels):
         own = Inertia(*(block[level.rows] for block in inertia))
-        moved = Push(*(each[level.rows] for each in push))
-        moved = Push(moved.turning - mv(own.mixed, level.closing), moved.moving - mv(own.moving, level.closing))
+        moved = Momenta(*(each[level.rows] for each in push))
+        moved = Momenta(moved.turning - mv(own.mixed, level.closing), moved.moving - mv(own.moving, level.closing))
         # A S, and S' A S + G
         across = own.turning + cross_rows(own.mixed, level.child)
         along = jnp.swapaxes(own.mixed, 1, 2) + cross_rows(own.moving, level.child)
@@ -585,7 +592,7 @@ def inwards(inertia: Inertia, push: Push, levels: list[Level]) -> tuple[Inertia,
             own.mixed - mm(jnp.swapaxes(half_turn, 1, 2), half_move),
             own.moving - mm(jnp.swapaxes(half_move, 1, 2), half_move),
         )
-        handed = Push(moved.turning - mv(across, turned), moved.moving - mv(along, turned))
+        handed = Momenta(moved.turning - mv(across, turned), moved.moving - mv(along, turned))
         turning, mixed, moving, handed = held((turning, mixed, moving, handed))
         arm = level.child - level.parent
         reaching = jnp.swapaxes(mixed, 1, 2) + cross_rows(moving, arm)
@@ -593,16 +600,16 @@ def inwards(inertia: Inertia, push: Push, levels: list[Level]) -> tuple[Inertia,
             turning + cross_rows(mixed, arm) - cross_columns(arm, reaching), mixed - cross_columns(arm, moving), moving
         )
         inertia = Inertia(*(_added(a, b, level.parents) for a, b in zip(inertia, onto, strict=True)))
-        handed = Push(handed.turning - cross(arm, handed.moving), handed.moving)
-        push = Push(*(_added(a, b, level.parents) for a, b in zip(push, handed, strict=True)))
+        handed = Momenta(handed.turning - cross(arm, handed.moving), handed.moving)
+        push = Momenta(*(_added(a, b, level.parents) for a, b in zip(push, handed, strict=True)))
         inertia, push = held((inertia, push))
     return inertia, push, passed[::-1]
 
 
-def solve(inertia: Inertia, push: Push, levels: list[Level]) -> tuple[Array, Array]:
+def solve(inertia: Inertia, push: Momenta, levels: list[Level]) -> tuple[Array, Array]:
     """Velocities and spins (n, 3, B) with which links part under their pushes and their joints' impulses."""
     inertia, push, passed = inwards(inertia, push, levels)
-    spin, velocity = _root(Inertia(*(block[:1] for block in inertia)), Push(*(each[:1] for each in push)))
+    spin, velocity = _root(Inertia(*(block[:1] for block in inertia)), Momenta(*(each[:1] for each in push)))
     rows = np.array([0])
     for level, (turned, to_turn, to_move, _) in zip(levels, passed, strict=True):
         above = np.array([int(np.flatnonzero(rows == parent)[0]) for parent in level.parents])
@@ -622,7 +629,7 @@ def _added(whole: Array, parts: Array, rows: np.ndarray) -> Array:
     return jnp.stack([sum((parts[i] for i in np.flatnonzero(rows == row)), whole[row]) for row in range(len(whole))])
 
 
-def _root(inertia: Inertia, push: Push) -> tuple[Array, Array]:
+def _root(inertia: Inertia, push: Momenta) -> tuple[Array, Array]:
     """Spin and velocity (1, 3, B) of a link without a parent, by the Schur complement of what moves."""
     still = invert(inertia.moving)
     lever = mm(inertia.mixed, still)

@@ -23,7 +23,7 @@ from larp_model.state import Trajectories
 
 
 @dataclass(frozen=True)
-class Constants:
+class MeetingConstants:
     """What is chosen here, not derived.
 
     margin: links whose gap within a step is larger do not feel each other [m]. advances: Newton steps of conservative
@@ -135,7 +135,9 @@ def parties(
     return one, two
 
 
-def meet(pair: Pair, first: Party, second: Party, dt: float, constants: Constants = Constants()) -> Meeting:
+def meet(
+    pair: Pair, first: Party, second: Party, dt: float, constants: MeetingConstants = MeetingConstants()
+) -> Meeting:
     """The contacts of a pair of bodies.
 
     Both links move on, evenly accelerated, until they meet (conservative advancement); the gap, normal and speeds are
@@ -191,7 +193,7 @@ def meet(pair: Pair, first: Party, second: Party, dt: float, constants: Constant
     )
 
 
-def within_reach(first: Party, second: Party, dt: float, constants: Constants = Constants()) -> Array:
+def within_reach(first: Party, second: Party, dt: float, constants: MeetingConstants = MeetingConstants()) -> Array:
     """(B, P) which links of the pair may come nearer than the margin within the step.
 
     False only where `near` of their meeting is zero: along the line between them their ends come no faster than this.

@@ -58,7 +58,7 @@ KINDS: dict[str, Any] = {
     "joint": Joint,
     "link": Link,
     "mechanics": mechanics.Constants,
-    "meeting": meeting.Constants,
+    "meeting": meeting.MeetingConstants,
     "motor": Motor,
     "over mechanics": OverMechanics,
     "pair": Pair,

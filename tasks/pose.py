@@ -106,7 +106,7 @@ class Reconstruction(NamedTuple):
     body: Body
     start: np.ndarray
     found: np.ndarray
-    wanted: physical.Wanted
+    wanted: physical.WantedMotion
     states: np.ndarray
     spent: Spent
 
@@ -120,7 +120,7 @@ def reconstruct(
     film: Keypoints,
     lifted: lift.Lifted,
     dynamics: DynamicsName = "larp",
-    preset: physical.Preset = physical.PRESETS["balanced"],
+    preset: physical.FitPreset = physical.PRESETS["balanced"],
     seed: int = 0,
     kept: Kept | None = None,
     at: Callable[[int, int], None] = lambda step, steps: None,

@@ -54,7 +54,7 @@ CANDIDATES = Preset((CEM(256, 10, 24, 1.0),), (CEM(128, 3, 24, 1.0),), every=4)
 LOSS = LossWeights(velocity=1e-2, far=0.05, fast=0.1, arm=0.14)
 
 
-class Stage(NamedTuple):
+class TrainingStage(NamedTuple):
     """A part of the training: what it is called, which episodes it adds first, if any, and how it trains."""
 
     name: str
@@ -81,28 +81,28 @@ RESPONSES = replace(IMPACTS, updates=8000, only=RESPONSE, loss=PRECISE)
 OVER_MECHANICS = replace(
     STEPS, updates=10000, contact_share=0.4, before_contact=5, loss=LOSS._replace(far=0.005, fast=0.02)
 )
-GENERAL = (Stage("steps", "", OVER_MECHANICS),)
+GENERAL = (TrainingStage("steps", "", OVER_MECHANICS),)
 # A struck ball is its launch, and nothing blurs that; what else is struck is a body like others, whose response counts
 # like the push.
-STRIKING_BALLS = (*GENERAL, Stage("impacts", "", IMPACTS))
-STRIKING = (*GENERAL, Stage("impacts", "", replace(IMPACTS, only=("contact", "response"), loss=LOSS)))
+STRIKING_BALLS = (*GENERAL, TrainingStage("impacts", "", IMPACTS))
+STRIKING = (*GENERAL, TrainingStage("impacts", "", replace(IMPACTS, only=("contact", "response"), loss=LOSS)))
 # Algorithm 1 of the paper, with its losses; in small batches, which are the most updates that two cores give. Where the
 # unroll grows by more at once, what worked for a few steps runs away within more.
 GROWING = ((2, 0.1), (3, 0.05), (4, 0.05), (6, 0.1), (8, 0.1), (11, 0.1), (14, 0.1), (17, 0.1), (20, 0.3))
 ALGORITHM_1 = training.Recipe(batch=64, curriculum=GROWING, learning_rate=3e-4, emphasis=())
-PAPER = (Stage("rollouts", "", ALGORITHM_1),)
+PAPER = (TrainingStage("rollouts", "", ALGORITHM_1),)
 KICK = (
-    Stage("steps", "", STEPS),
-    Stage("rollouts", "", ROLLOUTS),
-    Stage("planned1", "planned", AGAIN),
-    Stage("impacts1", "contacts", IMPACTS),
-    Stage("planned2", "planned", SWING),
-    Stage("impacts2", "contacts", replace(IMPACTS, updates=14000)),
-    Stage("responses", "", RESPONSES),
+    TrainingStage("steps", "", STEPS),
+    TrainingStage("rollouts", "", ROLLOUTS),
+    TrainingStage("planned1", "planned", AGAIN),
+    TrainingStage("impacts1", "contacts", IMPACTS),
+    TrainingStage("planned2", "planned", SWING),
+    TrainingStage("impacts2", "contacts", replace(IMPACTS, updates=14000)),
+    TrainingStage("responses", "", RESPONSES),
 )
 
 
-def stages_of(chosen: Scenario) -> tuple[Stage, ...]:
+def stages_of(chosen: Scenario) -> tuple[TrainingStage, ...]:
     """How the weights of a scene are trained over mechanics."""
     scene = chosen.scene
     if not chosen.strikes:

@@ -19,7 +19,7 @@ from tasks.kick import Kick, wished
 from tasks.live import ROLLS, SPOTS, TARGETS, Choices, Pushed, opened, weights_for
 from tasks.presets import PRESETS
 from viewer import LivePage, Push, Stopped
-from viewer.camera import VIEWS, Camera, View
+from viewer.camera import VIEWS, PictureCamera, View
 from viewer.handles import Handles
 from viewer.recording import known
 
@@ -136,6 +136,6 @@ def test_a_prediction_is_shown_as_far_as_it_was_worked_out() -> None:
 @given(st.sampled_from(VIEWS), st.floats(0.3, 3.0), st.integers(0, 100))
 def test_every_view_has_all_that_matters_in_its_picture(view: View, aspect: float, seed: int) -> None:
     points = np.random.default_rng(seed).uniform(-2.0, 4.0, (20, 3))
-    camera = Camera.of(points, 1.0 / aspect, view, 0.4 * aspect)
+    camera = PictureCamera.of(points, 1.0 / aspect, view, 0.4 * aspect)
     found = np.abs(camera(points)) / (1.0, 1.0 / aspect)
     assert (camera.depth(points) > 0.0).all() and found.max() == pytest.approx(1.0, abs=1e-6)

@@ -21,7 +21,7 @@ from larp_model import kinematics, rotation
 from larp_model import state as packed
 from larp_model.bodies import capsule, chain, human, human_and_ball
 from larp_model.compliance import moments
-from larp_model.mechanics import GAMMA, Constants, Motion, free_motion, impulse_response, reaction
+from larp_model.mechanics import GAMMA, BodyMotion, Constants, free_motion, impulse_response, reaction
 from larp_model.scene import Body, Scene
 from larp_model.truth.mujoco import Truth, closed, compile_model
 from tasks.motions.references import standing_on_ground
@@ -63,7 +63,7 @@ def starts(body: Body) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def motion_of(
     body: Body, state: Array, control: Array, torque: Array, gravity: float = 9.81, dt: float = 0.01, rounds: int = 0
-) -> Motion:
+) -> BodyMotion:
     """`free_motion` of the body as it is."""
     sizes, constants = kinematics.morphology_of(Scene((body,)))[None], Constants(rounds=rounds)
     return free_motion(body, state, control, torque, sizes, gravity, dt, constants)
@@ -77,13 +77,13 @@ def compiled(body: Body, rounds: int = 0) -> Any:
     return lambda *given, gravity=9.81, dt=0.01: found(*given, gravity, dt)
 
 
-def advanced(states: Array, motion: Motion) -> Array:
+def advanced(states: Array, motion: BodyMotion) -> Array:
     """States (N, n, 13) after a motion."""
     turned = rotation.integrate(packed.orientation(states), motion.turned)
     return packed.pack(packed.position(states) + motion.moved, turned, motion.velocity, motion.spin)
 
 
-def moved(states: np.ndarray, motion: Motion) -> np.ndarray:
+def moved(states: np.ndarray, motion: BodyMotion) -> np.ndarray:
     """The same, out of JAX."""
     return np.asarray(advanced(jnp.asarray(states), motion))
 
@@ -369,7 +369,9 @@ def test_who_moves_on_the_ground_is_three_times_nearer_to_the_truth_where_its_fo
 
         def advance(state: Array, control: Array) -> tuple[Array, Array]:
             none = jnp.zeros((*state.shape[:2], 3), state.dtype)
-            found = free_motion(body, state, control, none, sizes, scene.gravity, scene.dt, Constants(rounds=rounds))
+            found = free_motion(
+                body, state, control, none, sizes, scene.gravity, scene.dt, Constants(rounds=rounds)
+            )
             state = advanced(state, found)
             return state, packed.position(state)
 

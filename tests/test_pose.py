@@ -202,7 +202,7 @@ def test_plans_of_a_learned_model_alone_are_tried_in_the_truth() -> None:
 def test_a_slow_model_is_given_as_many_candidates_as_it_has_time_for(share: float) -> None:
     preset = physical.PRESETS["balanced"]
 
-    def candidates(preset: physical.Preset) -> int:
+    def candidates(preset: physical.FitPreset) -> int:
         return 1 + preset.steps.rounds * (preset.steps.directions + len(FACTORS))
 
     assert candidates(benchmark.as_fast(preset, share)) == pytest.approx(share * candidates(preset), abs=1.0)

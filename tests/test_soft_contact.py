@@ -13,7 +13,7 @@ from larp_model.designs import hybrid
 from larp_model.kinematics import Kinematics, kinematics, morphology_of
 from larp_model.launches import launches_of
 from larp_model.meeting import Velocities
-from larp_model.parts.contact import Contact, Known
+from larp_model.parts.contact import Contact, KnownContact
 from larp_model.parts.impacts import FreeImpact, SoftContacts
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
@@ -121,14 +121,14 @@ def test_four_times_as_many_substeps_change_little() -> None:
     assert np.median(error) < 0.02
 
 
-def known(scene: Scene, base: FreeImpact | SoftContacts, states: np.ndarray) -> Known:
+def known(scene: Scene, base: FreeImpact | SoftContacts, states: np.ndarray) -> KnownContact:
     """What a base knows of the contact of two balls."""
     model = hybrid(scene)
     [part] = model.pairs
     assert isinstance(part, Contact)
 
     @jax.jit
-    def ask(states: Array) -> Known:
+    def ask(states: Array) -> KnownContact:
         seen = model.each(kinematics(scene, states, morphology_of(scene)[None]))
         first, second = meeting.parties(part.pair, part.bodies, (seen[0], seen[1]), (free(seen[0]), free(seen[1])))
         return base.known(first, second, meeting.meet(part.pair, first, second, scene.dt), part)

@@ -22,7 +22,7 @@ from larp_model.errors import InputError
 from larp_model.state import ORIENTATION, POSITION, VELOCITY
 from viewer import LivePage, Recording, check_film, kick_picture, nearest_approach, write_film, write_html
 from viewer.app import Moment, News
-from viewer.camera import Camera
+from viewer.camera import PictureCamera
 from viewer.film import frames
 from viewer.panel import Panel
 from viewer.scene_view import Mesh, SceneView, football_meshes, unit_meshes
@@ -268,7 +268,7 @@ def test_the_film_goes_slowly_up_to_the_target_and_shows_what_moves(recording: R
 
 def test_the_camera_is_as_near_as_it_can_be_with_all_points_in_its_picture() -> None:
     points = np.random.default_rng(0).uniform(-1.0, 2.0, (50, 3))
-    found = abs(Camera.of(points, 0.5)(points)) / (1.0, 0.5)
+    found = abs(PictureCamera.of(points, 0.5)(points)) / (1.0, 0.5)
     assert found.max() == pytest.approx(1.0)
 
 

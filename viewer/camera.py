@@ -20,7 +20,7 @@ TANGENT = 0.32  # of half the angle of view, across
 MARGIN = 0.4  # m around what must be seen
 
 
-class Camera(NamedTuple):
+class PictureCamera(NamedTuple):
     """A pinhole. place: (3,) [m]. axes: (3, 3), right, up and forwards in rows. tangent: of half its angle across."""
 
     place: np.ndarray
@@ -28,7 +28,7 @@ class Camera(NamedTuple):
     tangent: float = TANGENT
 
     @classmethod
-    def of(cls, points: np.ndarray, aspect: float, view: View = "side", tangent: float = TANGENT) -> Camera:
+    def of(cls, points: np.ndarray, aspect: float, view: View = "side", tangent: float = TANGENT) -> PictureCamera:
         """The nearest one that has all of (P, 3) [m] in its picture. aspect: of the picture, height over width."""
         bearing, down = DIRECTIONS[view]
         forwards = np.array([np.cos(bearing), np.sin(bearing), -np.tan(down)])

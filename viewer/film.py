@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from larp_model.errors import InputError
 from larp_model.files import write_whole
 from larp_model.state import ORIENTATION, POSITION
-from viewer.camera import Camera, around
+from viewer.camera import PictureCamera, around
 from viewer.recording import Approach, Recording, nearest_approach
 from viewer.scene_view import BALL_PATCHES, PREDICTION, TARGET, TRUTH, Colour, football_meshes, link_colour
 
@@ -81,7 +81,7 @@ def write_film(recording: Recording, path: str | Path, size: tuple[int, int] = (
 def frames(recording: Recording, size: tuple[int, int] = (1280, 720), rate: float = 30.0) -> Iterator[np.ndarray]:
     """The pictures (height, width, 3) of a film, 0 to 255."""
     approach = nearest_approach(recording.path, recording.target)
-    camera = Camera.of(_seen(recording, approach), size[1] / size[0])
+    camera = PictureCamera.of(_seen(recording, approach), size[1] / size[0])
     across = size[1] / size[0]
     figure = Figure((size[0] / DOTS, size[1] / DOTS), DOTS, facecolor=SKY)
     canvas = FigureCanvasAgg(figure)
@@ -120,7 +120,7 @@ def _seen(recording: Recording, approach: Approach) -> np.ndarray:
     return around(links, way, np.asarray(recording.target, float))
 
 
-def _ground(axes: Axes, camera: Camera) -> None:
+def _ground(axes: Axes, camera: PictureCamera) -> None:
     """A grid of metres that fades away; it never moves, so that it is drawn once."""
     horizon = float(camera(camera.place + 1e4 * (camera.axes[2] * (1.0, 1.0, 0.0)))[1])
     axes.axhspan(-1.0, horizon, color=GROUND, zorder=0)
@@ -138,7 +138,7 @@ def _ground(axes: Axes, camera: Camera) -> None:
                 axes.add_collection(LineCollection(list(segments), colors=colours, lw=0.8, zorder=0.1))
 
 
-def _scene(axes: Axes, camera: Camera, recording: Recording, approach: Approach, time: float) -> None:
+def _scene(axes: Axes, camera: PictureCamera, recording: Recording, approach: Approach, time: float) -> None:
     """All that moves, at a time [s]."""
     dt, target = recording.scene.dt, np.asarray(recording.target, float)
     row = min(int(time / dt), len(recording.states) - 1)
@@ -204,7 +204,7 @@ def _scene(axes: Axes, camera: Camera, recording: Recording, approach: Approach,
         )  # fmt: skip
 
 
-def _ball(axes: Axes, camera: Camera, state: np.ndarray, radius: float) -> None:
+def _ball(axes: Axes, camera: PictureCamera, state: np.ndarray, radius: float) -> None:
     """A white disc, and of its dark patches those that face the camera."""
     centre = state[POSITION]
     middle, size = camera.sphere(centre, radius)
@@ -218,13 +218,13 @@ def _ball(axes: Axes, camera: Camera, state: np.ndarray, radius: float) -> None:
     axes.add_collection(PolyCollection(patches, facecolors=[dark], edgecolors=[dark], lw=0.3, zorder=3.81))
 
 
-def _hull(camera: Camera, ends: np.ndarray, radius: float) -> np.ndarray:
+def _hull(camera: PictureCamera, ends: np.ndarray, radius: float) -> np.ndarray:
     """The outline (P, 2) of a capsule between ends (2, 3) [m] in the picture."""
     discs = [camera.sphere(end, radius) for end in ends]
     return _wrapped(np.concatenate([middle + size * CIRCLE for middle, size in discs]))
 
 
-def _shadow(camera: Camera, ends: np.ndarray, radius: float) -> np.ndarray:
+def _shadow(camera: PictureCamera, ends: np.ndarray, radius: float) -> np.ndarray:
     """The outline (P, 2), in the picture, of what a capsule keeps from the ground."""
     on_ground = ends + np.maximum(ends[:, 2:], 0.0) * LIGHT
     discs = np.concatenate([end[:2] + radius * CIRCLE for end in on_ground])

@@ -8,7 +8,7 @@ from matplotlib import colormaps
 
 from larp_model.scene import Scene
 from larp_model.state import POSITION
-from viewer.camera import Camera, View, around
+from viewer.camera import PictureCamera, View, around
 from viewer.recording import Recording, nearest_approach
 from viewer.scene_view import PREDICTION, REFERENCE, TARGET, TRUTH, Colour, SceneView
 
@@ -150,11 +150,11 @@ class Stage:
         first = self._server.initial_camera
         first.fov, first.position, first.look_at = FIELD_OF_VIEW, camera.place, self.middle(camera)
 
-    def camera(self, view: View, aspect: float) -> Camera:
+    def camera(self, view: View, aspect: float) -> PictureCamera:
         """The camera that has in its picture, of width over height `aspect`, what `frame` said."""
-        return Camera.of(self._seen, 1.0 / aspect, view, float(np.tan(0.5 * FIELD_OF_VIEW)) * aspect)
+        return PictureCamera.of(self._seen, 1.0 / aspect, view, float(np.tan(0.5 * FIELD_OF_VIEW)) * aspect)
 
-    def middle(self, camera: Camera) -> np.ndarray:
+    def middle(self, camera: PictureCamera) -> np.ndarray:
         """The point (3,) [m] amid all that is seen on which a camera turns."""
         depth = float(camera.depth(self._seen).mean())
         return np.asarray(camera.place + depth * camera.axes[2])

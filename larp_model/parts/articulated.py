@@ -34,10 +34,12 @@ class Known(NamedTuple):
     inputs: Array
 
 
-class Base(Protocol):
+class BodyBase(Protocol):
     """What the changes of an articulated body are built upon."""
 
-    def begin(self, body: Body, seen: Kinematics, control: Array, torque: Array, gravity: float, dt: float) -> Known:
+    def begin(
+        self, body: Body, seen: Kinematics, control: Array, torque: Array, gravity: float, dt: float
+    ) -> Known:
         """What is known of a body that nothing but the ground touches."""
 
     def answer(self, body: Body, seen: Kinematics, hits: Hits, dt: float) -> Array:
@@ -70,7 +72,7 @@ class Articulated:
     body: Body
     dt: float
     gravity: float
-    base: Base
+    base: BodyBase
     size: Size
     response: Response | None = None
     bound: float = 20.0

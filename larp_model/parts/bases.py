@@ -26,8 +26,10 @@ class FromNothing:
     of the servos and how the ends of the links are to the ground.
     """
 
-    def begin(self, body: Body, seen: Kinematics, control: Array, torque: Array, gravity: float, dt: float) -> Known:
-        """See `Base`."""
+    def begin(
+        self, body: Body, seen: Kinematics, control: Array, torque: Array, gravity: float, dt: float
+    ) -> Known:
+        """See `BodyBase`."""
         turn = rotation.heading(packed.orientation(seen.state)[:, 0])
         vectors, scalars = paper_inputs(body, seen, control, torque)
         velocities, ends = ends_on_ground(seen, *Velocities.of(seen.state), dt)
@@ -52,8 +54,10 @@ class OverMechanics:
     constants: mechanics.Constants = field(default_factory=mechanics.Constants)
     lasting: bool = False
 
-    def begin(self, body: Body, seen: Kinematics, control: Array, torque: Array, gravity: float, dt: float) -> Known:
-        """See `Base`."""
+    def begin(
+        self, body: Body, seen: Kinematics, control: Array, torque: Array, gravity: float, dt: float
+    ) -> Known:
+        """See `BodyBase`."""
         state, links = seen.state, len(body.links)
         free = mechanics.free_motion(body, state, control, torque, seen.morphology, gravity, dt, self.constants)
         turn = rotation.course(packed.orientation(state)[:, 0], body.links[0].axis)
@@ -71,7 +75,7 @@ class OverMechanics:
         return Known(changes_of(state, after, free.moved, free.turned, dt), turn, inputs)
 
     def answer(self, body: Body, seen: Kinematics, hits: Hits, dt: float) -> Array:
-        """See `Base`. All impulses together act on positions for as long as they do on average."""
+        """See `BodyBase`. All impulses together act on positions for as long as they do on average."""
         push = hits.push
         impulse, travel = (contact.norm(each).sum(axis=-1) for each in (push[..., :3], hits.travel))
         acting = travel / jnp.maximum(impulse, 1e-6)

@@ -22,7 +22,7 @@ from larp_model.scene import Body, Pair
 UP = np.array([0.0, 0.0, 1.0], np.float32)
 
 
-class Known(NamedTuple):
+class KnownContact(NamedTuple):
     """What is known of P pairs of links that meet; vectors (B, P, 3) in the world frame.
 
     change: (B, P) of the speed at which they part [m/s]. lag: (B, P) [s] for which the impulses act on positions.
@@ -39,20 +39,20 @@ class Known(NamedTuple):
     scalars: tuple[Array, ...]
 
 
-class Base(Protocol):
+class ContactBase(Protocol):
     """What is known of a contact before anything learned is asked."""
 
     def prepared(self, party: Party) -> Party:
         """A party with what is worked out once for all its links."""
 
-    def known(self, first: Party, second: Party, met: Meeting, part: Contact) -> Known:
+    def known(self, first: Party, second: Party, met: Meeting, part: Contact) -> KnownContact:
         """What the links of two bodies do to each other."""
 
-    def flipped(self, known: Known) -> Known:
+    def flipped(self, known: KnownContact) -> KnownContact:
         """The same from the other's side."""
 
 
-class Push(NamedTuple):
+class LearnedImpulse(NamedTuple):
     """What a network adds: impulse (B, P, 3) [N s] on the other, and by how much (B, P, 1) [s] all of it acts longer.
 
     lifts: impulses (B, P, 3) [N s] with which the ground holds both.
@@ -62,19 +62,19 @@ class Push(NamedTuple):
     late: Array
     lifts: tuple[Array, Array]
 
-    def flipped(self) -> Push:
+    def flipped(self) -> LearnedImpulse:
         """The same from the other's side."""
-        return Push(-self.impulse, self.late, self.lifts[::-1])
+        return LearnedImpulse(-self.impulse, self.late, self.lifts[::-1])
 
-    def mean(self, other: Push) -> Push:
+    def mean(self, other: LearnedImpulse) -> LearnedImpulse:
         """Half of both."""
         return jax.tree.map(lambda a, b: 0.5 * (a + b), self, other)
 
     @staticmethod
-    def none(met: Meeting) -> Push:
+    def none(met: Meeting) -> LearnedImpulse:
         """Nothing beyond what is known."""
         nothing = jnp.zeros_like(met.normal)
-        return Push(nothing, nothing[..., :1], (nothing, nothing))
+        return LearnedImpulse(nothing, nothing[..., :1], (nothing, nothing))
 
 
 @dataclass(frozen=True)
@@ -95,12 +95,12 @@ class Contact:
     pair: Pair
     dt: float
     gravity: float
-    base: Base
+    base: ContactBase
     size: Size | None
     bounds: tuple[float, ...] = (1.0, 3.0, 1.0, 1.0, 1.0, 1.0, 1.0, 3.0, 3.0, 5.0)
     grounded: float = 0.03
     arm: float = 0.1
-    constants: meeting.Constants = field(default_factory=meeting.Constants)
+    constants: meeting.MeetingConstants = field(default_factory=meeting.MeetingConstants)
 
     @property
     def name(self) -> str:
@@ -174,7 +174,7 @@ class Contact:
         """Whether both bodies are of one kind."""
         return self.bodies[0].kind == self.bodies[1].kind
 
-    def inputs(self, me: Party, other: Party, met: Meeting, known: Known) -> Array:
+    def inputs(self, me: Party, other: Party, met: Meeting, known: KnownContact) -> Array:
         """What the network sees (B, P, F): products of the contact's vectors, scalars, and which links meet."""
         swings = (jnp.cross(party.before.spin, arm) for party, arm in zip((me, other), met.arms, strict=True))
         up = jnp.broadcast_to(jnp.asarray(UP, met.normal.dtype), met.normal.shape)
@@ -206,14 +206,14 @@ class Contact:
             which.append(jnp.broadcast_to(named, (*met.gap.shape, len(links))))
         return jnp.concatenate([*each, jnp.stack(scalars, axis=-1), *which], axis=-1)
 
-    def view(self, weights: Weights, me: Party, other: Party, met: Meeting, known: Known) -> Push:
+    def view(self, weights: Weights, me: Party, other: Party, met: Meeting, known: KnownContact) -> LearnedImpulse:
         """What one body does to the other, by its own lights, beyond what is known; nothing without a network.
 
         Along the normal: a share of the known change, and a speed. Across it: along the slide, and, in shares of that
         change, along the directions in which the links give way, of up, and of both arms.
         """
         if self.size is None:
-            return Push.none(met)
+            return LearnedImpulse.none(met)
         outputs = evaluate(self.networks()[self.name], weights, self.name, self.inputs(me, other, met, known))
         outputs = bounded(outputs, self.bounds) * met.near[..., None]
         scale, add, along, *shares, lift, other_lift, late = jnp.split(outputs, len(self.bounds), axis=-1)
@@ -229,7 +229,7 @@ class Contact:
             for speed, party, segment in zip((lift, other_lift), (me, other), met.segments, strict=True)
         )
         one, two = lifts
-        return Push(mass * velocity, 0.001 * late, (one, two))
+        return LearnedImpulse(mass * velocity, 0.001 * late, (one, two))
 
 
 def _clearance(party: Party, centre: Array) -> Array:
@@ -238,7 +238,7 @@ def _clearance(party: Party, centre: Array) -> Array:
     return centre[..., 2] - jnp.abs(segment.half[..., 2]) - segment.radius
 
 
-def _onto(party: Party, met: Meeting, known: Known, push: Push, number: int, sign: float) -> Hits:
+def _onto(party: Party, met: Meeting, known: KnownContact, push: LearnedImpulse, number: int, sign: float) -> Hits:
     """What is known and what is learned do to one of the bodies: its number, and the sign of impulses on it."""
     own = picked(jnp.eye(len(party.body.links), dtype=push.late.dtype)[None, party.rows], party.chosen)
     impulse, lift = sign * push.impulse, push.lifts[number]

@@ -13,7 +13,7 @@ from larp_model.compliance import moments, yields
 from larp_model.kinematics import picked
 from larp_model.mechanics import fading
 from larp_model.meeting import Meeting, Party
-from larp_model.parts.contact import UP, Contact, Known
+from larp_model.parts.contact import UP, Contact, KnownContact
 from larp_model.soft_contact import Loose, Rule, Side, Tied
 from larp_model.vector import Vector
 
@@ -31,8 +31,8 @@ class FreeImpact:
         """See `Base`: nothing is."""
         return party
 
-    def known(self, first: Party, second: Party, met: Meeting, part: Contact) -> Known:
-        """See `Base`."""
+    def known(self, first: Party, second: Party, met: Meeting, part: Contact) -> KnownContact:
+        """See `ContactBase`."""
         dt = part.dt
         acceleration = jnp.sum(met.gained * met.normal, axis=-1) / dt
         surface = part.pair.surface
@@ -41,10 +41,10 @@ class FreeImpact:
         both = -impulse, impulse
         one, two = (jnp.cross(arm, each) for arm, each in zip(met.arms, both, strict=True))
         travel = tuple(each * free.lag[..., None] for each in both)
-        return Known(free.change, free.lag, both, (one, two), (travel[0], travel[1]), (), tuple(free))
+        return KnownContact(free.change, free.lag, both, (one, two), (travel[0], travel[1]), (), tuple(free))
 
-    def flipped(self, known: Known) -> Known:
-        """See `Base`."""
+    def flipped(self, known: KnownContact) -> KnownContact:
+        """See `ContactBase`."""
         return _flipped(known)
 
 
@@ -58,15 +58,15 @@ class SoftContacts:
     rule: Rule = field(default_factory=Rule)
 
     def prepared(self, party: Party) -> Party:
-        """See `Base`."""
+        """See `ContactBase`."""
         if party.body.is_ball or not self.rule.fades:
             return party
         seen, (links, places) = party.seen, np.unique(party.rows, return_inverse=True)
         gives = fading(party.body, links, seen.matrices, seen.morphology, self.rule.fades)
         return party._replace(gives=tuple(each[:, places] for each in gives))
 
-    def known(self, first: Party, second: Party, met: Meeting, part: Contact) -> Known:
-        """See `Base`."""
+    def known(self, first: Party, second: Party, met: Meeting, part: Contact) -> KnownContact:
+        """See `ContactBase`."""
         one, two = (_side(party, met, number, part) for number, party in enumerate((first, second)))
         ground1, ground2 = (party.body.surface if party.body.is_ball else None for party in (first, second))
         time, apart = met.remaining, jnp.zeros(met.remaining.shape, bool)
@@ -84,15 +84,17 @@ class SoftContacts:
         lag = jnp.sum(travel2 * met.normal, axis=-1) / jnp.maximum(through, 1e-6)
         change, lag = through / met.mass, jnp.clip(lag, 0.0, met.remaining)
         speeds = between / mass, (impulse1 + between) / mass, (impulse2 - between) / mass
-        return Known(change, lag, (impulse1, impulse2), (moment1, moment2), (travel1, travel2), speeds, (change, lag))
+        return KnownContact(
+            change, lag, (impulse1, impulse2), (moment1, moment2), (travel1, travel2), speeds, (change, lag)
+        )
 
-    def flipped(self, known: Known) -> Known:
-        """See `Base`."""
+    def flipped(self, known: KnownContact) -> KnownContact:
+        """See `ContactBase`."""
         between, one, two = known.speeds
         return _flipped(known)._replace(speeds=(-between, two, one))
 
 
-def _flipped(known: Known) -> Known:
+def _flipped(known: KnownContact) -> KnownContact:
     return known._replace(impulses=known.impulses[::-1], moments=known.moments[::-1], travel=known.travel[::-1])
 
 

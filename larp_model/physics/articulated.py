@@ -20,7 +20,7 @@ from larp_model.mechanics import (
     Anchors,
     Inertia,
     Level,
-    Push,
+    Momenta,
     cross,
     inertias,
     local_anchors,
@@ -50,7 +50,7 @@ class Free(NamedTuple):
     matrices: Array
     tied: Anchors
     inertia: Inertia
-    push: Push
+    push: Momenta
     levels: list[Level]
     undamped: list[Level]
     carried: Array
@@ -65,7 +65,7 @@ class Free(NamedTuple):
         inertia = inertias(body, matrices, sizes)
         momentum = mv(inertia.turning, spin)
         falling = velocity + h * jnp.array([0.0, 0.0, -gravity], state.dtype)[:, None]
-        push = Push(momentum + h * (outside - cross(spin, momentum)), sizes[:, 2:3] * falling)
+        push = Momenta(momentum + h * (outside - cross(spin, momentum)), sizes[:, 2:3] * falling)
         stronger = strength(body, jnp.moveaxis(sizes, -1, 0))
         tied = turned_anchors(body, local_anchors(body, sizes), matrices)
         # How the two points of a joint accelerate apart as their links turn.
@@ -101,7 +101,7 @@ class Ball(NamedTuple):
     spin: Array
     radius: Array
     inertia: Inertia
-    push: Push
+    push: Momenta
 
     @staticmethod
     def of(state: Array, outside: Array, sizes: Array, gravity: float, h: float) -> Ball:
@@ -111,7 +111,7 @@ class Ball(NamedTuple):
         unit = jnp.broadcast_to(jnp.eye(3, dtype=state.dtype)[..., None], (1, 3, *spin.shape[1:]))
         falling = velocity + h * jnp.array([0.0, 0.0, -gravity], state.dtype)[:, None]
         inertia = Inertia(turning[:, :, None] * unit, jnp.zeros_like(unit), mass[:, :, None] * unit)
-        push = Push(turning * spin + h * outside, mass * falling)
+        push = Momenta(turning * spin + h * outside, mass * falling)
         return Ball(place, orientation, velocity, spin, sizes[:, 1:2], inertia, push)
 
 

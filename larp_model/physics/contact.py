@@ -34,7 +34,7 @@ from larp_model.errors import InputError
 from larp_model.mechanics import (
     Ends,
     Inertia,
-    Push,
+    Momenta,
     cross,
     cross_columns,
     cross_rows,
@@ -56,7 +56,7 @@ AllVelocities = tuple[Array, Array, Array, Array]
 AtContacts = tuple[Array, Array, Array]
 """Vectors (n, 3, B) at the contacts of links with the ground, of the ball with the ground, of links with the ball."""
 
-Tree = TypeVar("Tree", Inertia, Push)
+Tree = TypeVar("Tree", Inertia, Momenta)
 
 # Halvings of the interval in which the line search looks: to a 256th of a step.
 HALVINGS = 8
@@ -329,8 +329,8 @@ def _inertia(arm: Array, mass: Array) -> Inertia:
     return Inertia(-cross_rows(mixed, arm), mixed, mass)
 
 
-def _push(arm: Array, impulse: Array) -> Push:
-    return Push(cross(arm, impulse), impulse)
+def _push(arm: Array, impulse: Array) -> Momenta:
+    return Momenta(cross(arm, impulse), impulse)
 
 
 def _sum(*parts: Tree) -> Tree:
@@ -355,7 +355,7 @@ def _onto(rows: np.ndarray, links: int, parts: Tree) -> Tree:
     return result
 
 
-def _moved(gives: Inertia, push: Push) -> tuple[Array, Array]:
+def _moved(gives: Inertia, push: Momenta) -> tuple[Array, Array]:
     """Return velocity and spin (n, 3, B) by an inverse inertia (1, ...)."""
     spin = mv(gives.turning, push.turning) + mv(gives.mixed, push.moving)
     return mv(jnp.swapaxes(gives.mixed, 1, 2), push.turning) + mv(gives.moving, push.moving), spin

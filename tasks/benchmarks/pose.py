@@ -144,7 +144,7 @@ def dances_of(folder: Path, names: Sequence[str], cameras: int, seconds: float) 
     return films
 
 
-def as_fast(preset: physical.Preset, share: float) -> physical.Preset:
+def as_fast(preset: physical.FitPreset, share: float) -> physical.FitPreset:
     """A preset of which each plan tries a share of the candidates, in one round."""
     steps = preset.steps
     tried = 1 + steps.rounds * (steps.directions + len(FACTORS))
@@ -152,7 +152,7 @@ def as_fast(preset: physical.Preset, share: float) -> physical.Preset:
     return preset._replace(steps=replace(steps, rounds=1, directions=directions))
 
 
-def measured(film: Callable[[], Film], ways: Sequence[Way], preset: physical.Preset, seed: int) -> dict[str, Any]:
+def measured(film: Callable[[], Film], ways: Sequence[Way], preset: physical.FitPreset, seed: int) -> dict[str, Any]:
     """One film, reconstructed in each way."""
     name, keypoints, lens, true = film()
     lifted = lift.lift(keypoints, lens)

@@ -43,7 +43,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 
 @dataclass(frozen=True, eq=False)
-class Kick:
+class ReferenceKick:
     """A kick by the right foot over `time` (T,) [s] from its strike: flexions (T,) [deg], speed of the toe (T,) [m/s].
 
     A flexion is the pitch of the joint's rotation vector.
@@ -67,16 +67,16 @@ class Kick:
         return dict(zip(COLUMNS, map(float, (*values, plant[strike])), strict=True))
 
 
-def _kick(name: str, body: Body, angles: np.ndarray, toe: np.ndarray, strike: int, dt: float) -> Kick:
+def _kick(name: str, body: Body, angles: np.ndarray, toe: np.ndarray, strike: int, dt: float) -> ReferenceKick:
     """The kick of joint rotation vectors (T, J, 3) [rad] and toe speeds (T,) [m/s], `dt` [s] apart."""
     joints = [body.links[child].name for child, _, _ in body.motors]
     time = (np.arange(len(toe)) - strike) * dt
     shown = (time >= -BEFORE) & (time <= AFTER)
     flexion = {title: sign * np.degrees(angles[shown, joints.index(link), 1]) for title, link, sign in CURVES}
-    return Kick(name, time[shown], flexion, toe[shown])
+    return ReferenceKick(name, time[shown], flexion, toe[shown])
 
 
-def performed(name: str, scene: Scene, reference: Reference) -> Kick:
+def performed(name: str, scene: Scene, reference: Reference) -> ReferenceKick:
     """A reference's kick, from its states in the truth; the toe is the front end of the foot's axis."""
     human = scene.bodies[0]
     states = reference.states[:, scene.rows(human.name)]
@@ -91,7 +91,7 @@ def performed(name: str, scene: Scene, reference: Reference) -> Kick:
     return _kick(name, human, np.stack(angles, axis=1), np.linalg.norm(toe, axis=-1), reference.strike, scene.dt)
 
 
-def recorded(path: Path, scene: Scene) -> Kick:
+def recorded(path: Path, scene: Scene) -> ReferenceKick:
     """The fastest swing of a captured clip, as it was recorded; the toe is the toes' base. Left feet are mirrored."""
     motion = bvh.load(path)
     if skeleton.kicking_side(motion) == "Left":
@@ -105,7 +105,7 @@ def recorded(path: Path, scene: Scene) -> Kick:
     return _kick(path.stem, scene.bodies[0], angles, toe, round(skeleton.strike(clip) / clip.rate / scene.dt), scene.dt)
 
 
-def table(kicks: list[Kick]) -> Table:
+def table(kicks: list[ReferenceKick]) -> Table:
     """A row a kick, the embedded one first, and the range of the captured kicks."""
     rows = Table("kick", "kind", *COLUMNS.values(), title="Flexions at the strike and in the backswing [deg]")
 
@@ -121,7 +121,7 @@ def table(kicks: list[Kick]) -> Table:
     return rows
 
 
-def picture(kicks: list[Kick]) -> Figure:
+def picture(kicks: list[ReferenceKick]) -> Figure:
     """Flexions and toe speed over the time from the strike; walks dashed."""
     figure = Figure(figsize=(14, 8), layout="constrained")
     figure.suptitle("The embedded kick and captured ones", fontsize=16)

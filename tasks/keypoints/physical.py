@@ -45,7 +45,7 @@ SEARCH = 0.5
 NEAR, PACE, STILL = 0.05, 0.5, 0.3
 
 
-class Preset(NamedTuple):
+class FitPreset(NamedTuple):
     """How much a fit may cost: steps that a plan looks ahead and its knots, how it is found, steps between plans.
 
     verify: rounds of trials in the truth of each plan that a learned model finds, which correct it.
@@ -65,14 +65,14 @@ class Preset(NamedTuple):
 
 
 # Who looks only half a second ahead sees too late that a start leans too far, and falls.
-PRESETS: dict[PresetName, Preset] = {
-    "fast": Preset(80, 11, GaussNewton(rounds=2, directions=48)),
-    "balanced": Preset(80, 17, GaussNewton(rounds=4, directions=64)),
-    "accurate": Preset(80, 17, GaussNewton(rounds=2, directions=64), verify=6),
+PRESETS: dict[PresetName, FitPreset] = {
+    "fast": FitPreset(80, 11, GaussNewton(rounds=2, directions=48)),
+    "balanced": FitPreset(80, 17, GaussNewton(rounds=4, directions=64)),
+    "accurate": FitPreset(80, 17, GaussNewton(rounds=2, directions=64), verify=6),
 }
 
 
-class Wanted(NamedTuple):
+class WantedMotion(NamedTuple):
     """What a film asks for at each of N steps.
 
     states (N, L, 13) and targets (N, J, 3) [rad] of the kinematic start; places (N, P, 2) [px] and weights (N, P) of
@@ -86,7 +86,7 @@ class Wanted(NamedTuple):
     stands: np.ndarray
 
 
-def wanted_of(scene: Scene, figure: Figure, lifted: Lifted, keypoints: Keypoints) -> Wanted:
+def wanted_of(scene: Scene, figure: Figure, lifted: Lifted, keypoints: Keypoints) -> WantedMotion:
     """The kinematic start and the keypoints at every step of the scene's time."""
     human = scene.bodies[0]
     begin, rate = keypoints.times, keypoints.rate
@@ -113,7 +113,7 @@ def wanted_of(scene: Scene, figure: Figure, lifted: Lifted, keypoints: Keypoints
     points = figure.all_points(Pose(place, root.as_matrix(), angles), lifted.proportions)[:, FEET]
     speed = np.linalg.norm(np.gradient(points, scene.dt, axis=0), axis=-1)
     stands = np.exp(-((np.maximum(points[..., 2] - 0.03, 0.0) / 0.05) ** 2)) / (1.0 + (speed / SLOW) ** 2) ** 2
-    return Wanted(states, leading(scene, angles), places, trusted[nearest], stands)
+    return WantedMotion(states, leading(scene, angles), places, trusted[nearest], stands)
 
 
 class Seen:
@@ -149,25 +149,25 @@ def terms_of(seen: Seen, camera: Camera, sigma: float, dt: float) -> tuple[CostT
     """The named costs of a candidate."""
     feet = np.array(FEET)
 
-    def image(states: Array, controls: Array, context: Wanted) -> Array:
+    def image(states: Array, controls: Array, context: WantedMotion) -> Array:
         apart = (camera.project(seen.points(states)) - context.places) / sigma
         return (jnp.sqrt(context.weights)[..., None] * jnp.clip(apart, -30.0, 30.0)).reshape(len(states), -1)
 
-    def near(states: Array, controls: Array, context: Wanted) -> Array:
+    def near(states: Array, controls: Array, context: WantedMotion) -> Array:
         return ((packed.position(states) - context.states[..., packed.POSITION]) / NEAR).reshape(len(states), -1)
 
-    def pace(states: Array, controls: Array, context: Wanted) -> Array:
+    def pace(states: Array, controls: Array, context: WantedMotion) -> Array:
         return ((packed.velocity(states) - context.states[..., packed.VELOCITY]) / PACE).reshape(len(states), -1)
 
-    def slip(states: Array, controls: Array, context: Wanted) -> Array:
+    def slip(states: Array, controls: Array, context: WantedMotion) -> Array:
         points = seen.points(states)[:, feet]
         moved = (points[1:] - points[:-1]) / (dt * STILL)
         return (context.stands[1:, :, None] * moved).reshape(len(moved), -1)
 
-    def effort(states: Array, controls: Array, context: Wanted) -> Array:
+    def effort(states: Array, controls: Array, context: WantedMotion) -> Array:
         return (controls - context.targets).reshape(len(controls), -1)
 
-    def smooth(states: Array, controls: Array, context: Wanted) -> Array:
+    def smooth(states: Array, controls: Array, context: WantedMotion) -> Array:
         second = controls[2:] - 2.0 * controls[1:-1] + controls[:-2]
         return (second / 0.02).reshape(len(second), -1)
 
@@ -182,10 +182,10 @@ def terms_of(seen: Seen, camera: Camera, sigma: float, dt: float) -> tuple[CostT
 
 
 def planner_of(
-    scene: Scene, seen: Seen, camera: Camera, sigma: float, dynamics: Dynamics, preset: Preset,
+    scene: Scene, seen: Seen, camera: Camera, sigma: float, dynamics: Dynamics, preset: FitPreset,
     truth: Dynamics | None = None,
 ) -> Planner:  # fmt: skip
-    """A planner of these costs; sigma: standard deviation of the keypoints [px]. truth: see `Preset.optimizers`."""
+    """A planner of these costs; sigma: standard deviation of the keypoints [px]. truth: see `FitPreset.optimizers`."""
     bounds = np.array([(motor.lower, motor.upper) for motor in scene.motors])
     return Planner(
         dynamics, terms_of(seen, camera, sigma, scene.dt), preset.horizon, preset.knots, scene.dt,
@@ -193,7 +193,7 @@ def planner_of(
     )  # fmt: skip
 
 
-def started(scene: Scene, wanted: Wanted) -> np.ndarray:
+def started(scene: Scene, wanted: WantedMotion) -> np.ndarray:
     """The state (L, 13) in which the execution begins: the kinematic start's, on the ground."""
     human, state = scene.bodies[0], wanted.states[0].copy()
     sunk = clearance(human, state[None], human.sizes[None])[0]
@@ -202,7 +202,7 @@ def started(scene: Scene, wanted: Wanted) -> np.ndarray:
 
 
 def fit(
-    scene: Scene, planner: Planner, wanted: Wanted, state: np.ndarray, every: int, seed: int = 0,
+    scene: Scene, planner: Planner, wanted: WantedMotion, state: np.ndarray, every: int, seed: int = 0,
     observe: Callable[[Execution], None] = lambda execution: None, begun: Begun | None = None,
 ) -> Execution:  # fmt: skip
     """Plan and execute in the truth, from a state (L, 13) on, until what is wanted ends; see `mpc.loop.execute`.
@@ -214,7 +214,7 @@ def fit(
     def window(step: int) -> Window:
         after = np.minimum(step + 1 + np.arange(horizon), steps)
         now = np.minimum(step + np.arange(horizon), steps)
-        context = Wanted(*(each[after] for each in wanted))._replace(targets=wanted.targets[now])
+        context = WantedMotion(*(each[after] for each in wanted))._replace(targets=wanted.targets[now])
         return Window(wanted.targets[now], context)
 
     phase = Phase(planner, planner, every, window)

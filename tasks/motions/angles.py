@@ -19,7 +19,7 @@ FIELDS = ("rate", "position", "orientation", "angles")
 RATES = (10.0, 1000.0)
 
 
-class _Joint(NamedTuple):
+class _ChildJoint(NamedTuple):
     """A joint: the link that it carries, its parent's row, its place in the parent's link [m], its turn to a T-pose."""
 
     name: str
@@ -110,12 +110,12 @@ def _of_links(body: Body, rate: float, position: np.ndarray, turned: list[Rotati
     }
     links = {link.name: row for row, link in enumerate(body.links)}
     none = Rotation.identity()
-    rows = [_Joint("Hips", 0, -1, np.zeros(3), none)]
+    rows = [_ChildJoint("Hips", 0, -1, np.zeros(3), none)]
     place = {"Hips": 0}
 
     def add(name: str, link: int, parent: str, offset: np.ndarray, turn: Rotation) -> None:
         place[name] = len(rows)
-        rows.append(_Joint(name, link, place[parent], offset, turn))
+        rows.append(_ChildJoint(name, link, place[parent], offset, turn))
 
     def between(link: int) -> np.ndarray:
         """From the parent's joint to the link's own, in the parent link's frame."""
