@@ -18,7 +18,8 @@ from larp_model.parts.bases import FromNothing, OverMechanics
 from larp_model.parts.contact import Contact, ContactBase
 from larp_model.parts.impacts import FreeImpact, SoftContacts
 from larp_model.parts.paper import PaperBody, PaperContact
-from larp_model.parts.part import BodyPart, Model, PairPart, ordered
+from larp_model.parts.part import Model, ModelledBody, ModelledPair, ordered
+from larp_model.parts.residual import FreeBall, ResidualBody, SoftContact
 from larp_model.parts.sphere import Sphere
 from larp_model.scene import Body, Pair, Scene
 from larp_model.soft_contact import Rule
@@ -61,15 +62,24 @@ def hybrid(scene: Scene, sizes: Sizes = SIZES["small"]) -> Model:
     # A body's own links press on each other for longer than an impact: with fading, legs slip further through. What a
     # network learned there was no better than mechanics for the lean human, and worse for the full one.
     between, within = (SoftContacts(Rule(fades=FADES)), sizes.contact), (SoftContacts(), None)
-    return _impulsive(
-        scene, sizes, OverMechanics(Constants(rounds=3), lasting=True), between, within, sliding=True
-    )
+    return _impulsive(scene, sizes, OverMechanics(Constants(rounds=3), lasting=True), between, within, sliding=True)
+
+
+def physical(scene: Scene, size: Size | None = None) -> Model:
+    """Return the model over physics of bodies and contacts; size: of the networks of bodies, None for none."""
+
+    def body_part(body: Body) -> ModelledBody:
+        if body.is_ball:
+            return FreeBall(body, scene.dt, scene.gravity)
+        return ResidualBody(body, scene.dt, scene.gravity, size)
+
+    return _made(scene, body_part, lambda bodies, pair: SoftContact(bodies, pair, scene.dt, scene.gravity))
 
 
 def paper(scene: Scene, sizes: Sizes = PAPER) -> Model:
     """The paper's model."""
 
-    def body_part(body: Body) -> BodyPart:
+    def body_part(body: Body) -> ModelledBody:
         return PaperBody(body, scene.dt, sizes.ball if body.is_ball else sizes.body)
 
     return _made(scene, body_part, lambda bodies, pair: PaperContact(bodies, pair, scene.dt, sizes.contact))
@@ -87,21 +97,23 @@ def _impulsive(
 ) -> Model:
     """Bodies and contacts that are impulses, on these bases, with networks of these sizes: of two, within one."""
 
-    def body_part(body: Body) -> BodyPart:
+    def body_part(body: Body) -> ModelledBody:
         if body.is_ball:
             return Sphere(body, scene.dt, scene.gravity, sizes.ball, sliding=sliding)
         touched = any(body.name in (pair.first, pair.second) for pair in scene.pairs)
         response = Response(sizes.contact) if touched else None
         return Articulated(body, scene.dt, scene.gravity, base, sizes.body, response)
 
-    def pair_part(bodies: tuple[Body, Body], pair: Pair) -> PairPart:
+    def pair_part(bodies: tuple[Body, Body], pair: Pair) -> ModelledPair:
         return Contact(bodies, pair, scene.dt, scene.gravity, *(within if pair.first == pair.second else between))
 
     return _made(scene, body_part, pair_part)
 
 
 def _made(
-    scene: Scene, body_part: Callable[[Body], BodyPart], pair_part: Callable[[tuple[Body, Body], Pair], PairPart]
+    scene: Scene,
+    body_part: Callable[[Body], ModelledBody],
+    pair_part: Callable[[tuple[Body, Body], Pair], ModelledPair],
 ) -> Model:
     pairs = (pair_part(bodies, pair) for pair, bodies in ordered(scene))
     return Model(scene, tuple(body_part(body) for body in scene.bodies), tuple(pairs))

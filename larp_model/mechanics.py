@@ -40,6 +40,7 @@ class Constants:
     closing: share of a joint's displacement that a step takes back (J. Baumgarte, Computer Methods 1 (1972)). standing,
     sliding: an end that stands on the ground is held as if by so many times its body's mass, one that slides by so
     many: held harder, a direction of sliding that is half a step old throws the body. held: see `compliance.HELD`.
+    products: what velocity products do to an end on the ground is left out, as in MuJoCo (`velocity_products`).
     rounds: Newton steps in which the ground's forces are found, all of them at once, and what slides is held like what
     stands (`reaction`). 0: which end stands, slides or lifts is decided beforehand, each as if its link were free
     (`Ends.decided`): quicker, and three times further from the truth after 0.1 s of motion and more.
@@ -50,6 +51,7 @@ class Constants:
     sliding: float = 0.2
     held: float = HELD
     rounds: int = 0
+    products: bool = False
 
 
 class BodyMotion(NamedTuple):
@@ -86,6 +88,16 @@ class Anchors(NamedTuple):
     parent: Array
 
 
+class Articulation(NamedTuple):
+    """Inertia of an articulated body's links within a step, the ground's contacts included, and where its joints are.
+
+    Batch last.
+    """
+
+    inertia: Inertia
+    tied: Anchors
+
+
 Begun = tuple[Array, Array, Array, Array]
 """What a stage starts from: see `free_motion`."""
 
@@ -114,18 +126,30 @@ def free_motion(
 
     control (B, j, 3) joint targets [rad], torque (B, n, 3) [N m] from outside, morphology (B or 1, n, 3).
     """
+    before, targets, outside, sizes = (jnp.moveaxis(each, 0, -1) for each in (state, control, torque, morphology))
+    motion, _ = articulated_motion(body, before, targets, outside, sizes, gravity, dt, constants)
+    return BodyMotion(*(jnp.moveaxis(each, -1, 0) for each in motion))
+
+
+def articulated_motion(
+    body: Body, state: Array, targets: Array, outside: Array, sizes: Array, gravity: float, dt: float,
+    constants: Constants = Constants(),
+) -> tuple[BodyMotion, Articulation]:  # fmt: skip
+    """Return `free_motion` with the batch last, and with what the body moves in the first of its two stages.
+
+    state (n, 13, B), targets (j, 3, B) [rad], outside (n, 3, B) [N m], sizes (n, 3, B or 1).
+    """
     h = GAMMA * dt
-    state, targets, outside, sizes = (jnp.moveaxis(each, 0, -1) for each in (state, control, torque, morphology))
     position, orientation, velocity, spin = (
         state[:, columns] for columns in (packed.POSITION, packed.ORIENTATION, packed.VELOCITY, packed.ANGULAR_VELOCITY)
     )
-    local, stronger = local_anchors(body, sizes), strength(body, morphology)
+    local, stronger = local_anchors(body, sizes), strength(body, jnp.moveaxis(sizes, -1, 0))
     child, parent = turned_anchors(body, local, turns(orientation))
     parents = np.array([joint.parent for joint in body.joints], int)
     gap = position[parents] + parent - (position[1:] + child)
     down = jnp.array([0.0, 0.0, -gravity], state.dtype)[:, None]
 
-    def stage(raised: Array, turned: Array, velocity: Array, spin: Array) -> tuple[Array, Array]:
+    def stage(raised: Array, turned: Array, velocity: Array, spin: Array) -> tuple[tuple[Array, Array], Articulation]:
         """Velocities and spins `h` later, of links raised by (n, 1, B) [m] and turned by (n, 3, B) [rad] before."""
         start = turn(orientation, turned)
         matrices = turns(turn(start, h * spin))
@@ -147,9 +171,13 @@ def free_motion(
             bears, pushed = held(jax.tree.map(jnp.add, (inertia, push), bearing))
             return solve(bears, pushed, levels)
 
-        ends, whole = Ends.of(body, before, height, velocity, spin, sizes, h), jnp.sum(mass, axis=0, keepdims=True)
+        gains = velocity_products(body, tied, spin) if constants.products else None
+        ends = Ends.of(body, before, height, velocity, spin, sizes, h, gains)
+        whole = jnp.sum(jnp.broadcast_to(mass, velocity[:, :1].shape), axis=0, keepdims=True)
         if not constants.rounds:
-            return parting(ends.decided(body, velocity, spin, gravity, h, constants, whole))
+            return parting(ends.decided(body, velocity, spin, gravity, h, constants, whole)), Articulation(
+                inertia, tied
+            )
         firm = constants.standing * whole
 
         def round_of(guess: tuple[Array, Array, Array], nothing: None) -> tuple[tuple[Array, Array, Array], None]:
@@ -159,24 +187,46 @@ def free_motion(
             return (*parting(ends.found(there, met, firm, body.surface.friction)), met), None
 
         falls = velocity + h * down, spin, jnp.zeros_like(ends.clearance)
-        (velocity, spin, _), _ = jax.lax.scan(round_of, falls, length=constants.rounds)
-        return velocity, spin
+        (velocity, spin, met), _ = jax.lax.scan(round_of, falls, length=constants.rounds)
+        bearing, _ = ends.found(ends.velocity(velocity, spin), met, firm, body.surface.friction)
+        return (velocity, spin), Articulation(jax.tree.map(jnp.add, inertia, bearing), tied)
 
     ratio = (1.0 - GAMMA) / GAMMA
 
-    def advance(begun: Begun, nothing: None) -> tuple[Begun, tuple[Array, Array]]:
+    def advance(begun: Begun, nothing: None) -> tuple[Begun, tuple[tuple[Array, Array], Articulation]]:
         raised, turned, velocity, spin = begun
-        after = stage(raised, turned, velocity, spin)
+        after, articulation = stage(raised, turned, velocity, spin)
         late = (1.0 - GAMMA) * dt
         goes_on = velocity + ratio * (after[0] - velocity), spin + ratio * (after[1] - spin)
-        return (late * after[0][:, 2:], late * after[1], *goes_on), after
+        return (late * after[0][:, 2:], late * after[1], *goes_on), (after, articulation)
 
     still = jnp.zeros_like(spin)
-    _, (velocities, spins) = jax.lax.scan(advance, (still[:, 2:], still, velocity, spin), length=2)
-    (velocity1, velocity2), (spin1, spin2) = velocities, spins
-    begun = (1.0 - GAMMA) * dt * spin1
-    moved = dt * ((1.0 - GAMMA) * velocity1 + GAMMA * velocity2)
-    return BodyMotion(*(jnp.moveaxis(each, -1, 0) for each in (velocity2, spin2, moved, begun + h * spin2)))
+    _, ((velocities, spins), stages) = jax.lax.scan(advance, (still[:, 2:], still, velocity, spin), length=2)
+    moved, turned = (dt * ((1.0 - GAMMA) * one + GAMMA * two) for one, two in (velocities, spins))
+    first: Articulation = jax.tree.map(lambda each: each[0], stages)
+    return BodyMotion(velocities[1], spins[1], moved, turned), first
+
+
+def velocity_products(body: Body, tied: Anchors, spin: Array) -> tuple[Array, Array]:
+    """Return accelerations (n, 3, B) [m/s^2] and [rad/s^2] of links whose root and joints do not accelerate.
+
+    MuJoCo leaves them out of a contact's acceleration. tied: from links' centres to their joints.
+    """
+    parents = np.array([joint.parent for joint in body.joints], int)
+    # How the two points of a joint accelerate apart as their links turn, and the joint's axes with the child.
+    closing = cross(spin[parents], cross(spin[parents], tied.parent))
+    closing -= cross(spin[1:], cross(spin[1:], tied.child))
+    carried = cross(spin[1:], spin[1:] - spin[parents])
+    velocity = turning = jnp.zeros_like(spin[:1])
+    rows = np.array([0])
+    for level, above in tree(body):
+        known, joint = np.array([int(np.flatnonzero(rows == row)[0]) for row in above]), level - 1
+        outer = turning[known] + carried[joint]
+        moving = velocity[known] + cross(turning[known], tied.parent[joint]) - cross(outer, tied.child[joint])
+        velocity, turning = jnp.concatenate([velocity, moving + closing[joint]]), jnp.concatenate([turning, outer])
+        rows = np.concatenate([rows, level])
+    order = np.argsort(rows)
+    return velocity[order], turning[order]
 
 
 def impulse_response(
@@ -451,13 +501,21 @@ class Ends(NamedTuple):
     allowed: Array
 
     @staticmethod
-    def of(body: Body, matrices: Array, height: Array, velocity: Array, spin: Array, sizes: Array, h: float) -> Ends:
-        """Of links that are so turned (n, 3, 3, B), so high (n, 1, B) [m] and so fast at first (n, 3, B)."""
+    def of(
+        body: Body, matrices: Array, height: Array, velocity: Array, spin: Array, sizes: Array, h: float,
+        gains: tuple[Array, Array] | None = None,
+    ) -> Ends:  # fmt: skip
+        """Of links that are so turned (n, 3, 3, B), so high (n, 1, B) [m] and so fast at first (n, 3, B).
+
+        gains: accelerations of the links, (n, 3, B) [m/s^2] and [rad/s^2], that contacts do not count.
+        """
         surface, upright = body.surface, _upright(matrices)
         axes = jnp.array([link.axis for link in body.links], matrices.dtype)[..., None]
         half, down = 0.5 * sizes[:, :1] * mv(matrices, axes), sizes[:, 1:2] * upright
         arm = jnp.concatenate([half - down, -half - down])
         speed, clearance = twice(velocity) + cross(twice(spin), arm), twice(height) + arm[:, 2:]
+        if gains is not None:
+            speed += h * (twice(gains[0]) + cross(twice(gains[1]), arm))
         damped = 1.0 + h * surface.damping
         rising = (speed[:, 2:] - h * surface.stiffness * clearance) / (damped + h**2 * surface.stiffness)
         return Ends(arm, clearance, speed * (1.0 - upright) / damped + rising * upright)
@@ -557,13 +615,15 @@ class Joined(NamedTuple):
     """Of a level's joints: what turns them, (n, 3, B), by their pushes, and (n, 3, 3, B) by their parents' motion.
 
     turned: alone [rad/s]. to_turn, to_move: less per spin and per velocity of the parent, seen from the link. factor:
-    the lower triangle L of what resists the joint's turning, L L'.
+    the lower triangle L of what resists the joint's turning, L L'. half_turn, half_move: L' times to_turn, to_move.
     """
 
     turned: Array
     to_turn: Array
     to_move: Array
     factor: Array
+    half_turn: Array
+    half_move: Array
 
 
 def inwards(inertia: Inertia, push: Momenta, levels: list[Level]) -> tuple[Inertia, Momenta, list[Joined]]:
@@ -585,7 +645,7 @@ def inwards(inertia: Inertia, push: Momenta, levels: list[Level]) -> tuple[Inert
         to_turn, to_move = upper(factor, half_turn), upper(factor, half_move)
         turned = upper(factor, half)[:, :, 0]
         turned, to_turn, to_move = held((turned, to_turn, to_move))
-        passed.append(Joined(turned, to_turn, to_move, factor))
+        passed.append(Joined(turned, to_turn, to_move, factor, half_turn, half_move))
         # What the joint hands on: A - A S (S' A S + G)^-1 S' A, seen from the parent's centre
         turning, mixed, moving = (
             own.turning - mm(jnp.swapaxes(half_turn, 1, 2), half_turn),
@@ -599,9 +659,9 @@ def inwards(inertia: Inertia, push: Momenta, levels: list[Level]) -> tuple[Inert
         onto = Inertia(
             turning + cross_rows(mixed, arm) - cross_columns(arm, reaching), mixed - cross_columns(arm, moving), moving
         )
-        inertia = Inertia(*(_added(a, b, level.parents) for a, b in zip(inertia, onto, strict=True)))
+        inertia = Inertia(*(added(a, b, level.parents) for a, b in zip(inertia, onto, strict=True)))
         handed = Momenta(handed.turning - cross(arm, handed.moving), handed.moving)
-        push = Momenta(*(_added(a, b, level.parents) for a, b in zip(push, handed, strict=True)))
+        push = Momenta(*(added(a, b, level.parents) for a, b in zip(push, handed, strict=True)))
         inertia, push = held((inertia, push))
     return inertia, push, passed[::-1]
 
@@ -611,7 +671,7 @@ def solve(inertia: Inertia, push: Momenta, levels: list[Level]) -> tuple[Array, 
     inertia, push, passed = inwards(inertia, push, levels)
     spin, velocity = _root(Inertia(*(block[:1] for block in inertia)), Momenta(*(each[:1] for each in push)))
     rows = np.array([0])
-    for level, (turned, to_turn, to_move, _) in zip(levels, passed, strict=True):
+    for level, (turned, to_turn, to_move, *_) in zip(levels, passed, strict=True):
         above = np.array([int(np.flatnonzero(rows == parent)[0]) for parent in level.parents])
         turning, moving = spin[above], velocity[above]
         arm = level.child - level.parent
@@ -624,7 +684,7 @@ def solve(inertia: Inertia, push: Momenta, levels: list[Level]) -> tuple[Array, 
     return velocity[order], spin[order]
 
 
-def _added(whole: Array, parts: Array, rows: np.ndarray) -> Array:
+def added(whole: Array, parts: Array, rows: np.ndarray) -> Array:
     """The whole (n, ...) with parts added to its rows, in which one may come more than once."""
     return jnp.stack([sum((parts[i] for i in np.flatnonzero(rows == row)), whole[row]) for row in range(len(whole))])
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -15,16 +16,21 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike, DTypeLike
 
+from larp_model import designs
 from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.errors import InputError
 from larp_model.kinematics import Kinematics, kinematics, morphology_of
+from larp_model.mechanics import BodyMotion
 from larp_model.meeting import Velocities
 from larp_model.names import require_known
 from larp_model.networks import Weights
-from larp_model.parts.part import Hits, Model
+from larp_model.parts.part import BodyPart, Hits, Model, PairPart
+from larp_model.parts.residual import FreeBall, ResidualBody, SoftContact
+from larp_model.physics.collision import Rule
+from larp_model.physics.step import step as physics_step
 from larp_model.runtime import remember_compilations
-from larp_model.scene import Scene
+from larp_model.scene import Body, Scene
 
 
 def step(
@@ -39,24 +45,43 @@ def step(
     scene = model.scene
     torque = jnp.zeros((*state.shape[:-1], 3), state.dtype) if torque is None else torque
     sizes = morphology_of(scene)[None].astype(state.dtype) if morphology is None else morphology
+    if isinstance(model.bodies[0], ResidualBody | FreeBall):
+        return _over_physics(model, weights, state, control, torque, sizes)
+    bodies = cast(tuple[BodyPart, ...], model.bodies)
     seen = model.each(kinematics(scene, state, sizes))
     moving = [
         part.move(weights, own, control[:, scene.motor_rows(part.body.name)], torque[:, scene.rows(part.body.name)])
-        for part, own in zip(model.bodies, seen, strict=True)
+        for part, own in zip(bodies, seen, strict=True)
     ]
     free = [each.free for each in moving]
     hits = pooled(model, weights, *(jax.lax.stop_gradient((seen, free)) if stop_gradient else (seen, free)))
     after = [
-        part.respond(weights, own, moved, hit)
-        for part, own, moved, hit in zip(model.bodies, seen, moving, hits, strict=True)
+        part.respond(weights, own, moved, hit) for part, own, moved, hit in zip(bodies, seen, moving, hits, strict=True)
     ]
     return jnp.concatenate(after, axis=1)
+
+
+def _over_physics(model: Model, weights: Weights, state: Array, control: Array, torque: Array, sizes: Array) -> Array:
+    """Return the states after a step of physics, in which networks correct how bodies move by themselves."""
+    scene, parts = model.scene, {part.body.name: part for part in model.bodies}
+
+    def correct(body: Body, before: Array, motion: BodyMotion, dt: float) -> BodyMotion:
+        part = parts[body.name]
+        if not isinstance(part, ResidualBody) or part.size is None:
+            return motion
+        seen = kinematics(scene.only(body.name), jnp.moveaxis(before, -1, 0), sizes[:, scene.rows(body.name)])
+        corrected = part.corrected(weights, seen, BodyMotion(*(jnp.moveaxis(each, -1, 0) for each in motion)), dt)
+        return BodyMotion(*(jnp.moveaxis(each, 0, -1) for each in corrected))
+
+    constants = {name: part.constants for name, part in parts.items() if isinstance(part, ResidualBody)}
+    rules = [part.rule for part in model.pairs if isinstance(part, SoftContact)]
+    return physics_step(scene, state, control, torque, sizes, constants, (rules or [Rule()])[0], correct)
 
 
 def pooled(model: Model, weights: Weights, seen: list[Kinematics], free: list[Velocities]) -> list[Hits]:
     """Sum f_c over the contacts of every link, body by body (equation 1 of the paper)."""
     hits = [Hits.none(own) for own in seen]
-    for pair in model.pairs:
+    for pair in cast(tuple[PairPart, ...], model.pairs):
         both = model.of(pair)
         first, second = both
         met = pair.meet(weights, (seen[first], seen[second]), (free[first], free[second]))
@@ -87,6 +112,12 @@ class Simulator:
             require_known("weights", str(weights), sorted(each.stem for each in stored.SHIPPED.glob("*.json")))
             manifest = stored.SHIPPED / f"{weights}.json"
         return Simulator(*stored.load(manifest, scene)[:2])
+
+    @staticmethod
+    def of_physics(scene: Scene) -> Simulator:
+        """Return the simulator of any scene with nothing learned."""
+        remember_compilations()
+        return Simulator(designs.physical(scene), Weights({}, {}, {}))
 
     @property
     def scene(self) -> Scene:

@@ -29,9 +29,9 @@ from larp_model.parts.contact import Contact
 from larp_model.parts.impacts import FreeImpact, SoftContacts
 from larp_model.parts.paper import PaperBody, PaperContact
 from larp_model.parts.part import (
-    BodyPart,
     Model,
-    PairPart,
+    ModelledBody,
+    ModelledPair,
     assemble,
     bodies_of,
     initial_weights,
@@ -39,7 +39,9 @@ from larp_model.parts.part import (
     name_of,
     ordered,
 )
+from larp_model.parts.residual import FreeBall, ResidualBody, SoftContact
 from larp_model.parts.sphere import Sphere
+from larp_model.physics.collision import Rule as ContactRule
 from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface
 from larp_model.soft_contact import Rule
 
@@ -53,6 +55,8 @@ KINDS: dict[str, Any] = {
     "articulated": Articulated,
     "body": Body,
     "contact": Contact,
+    "contact rule": ContactRule,
+    "free ball": FreeBall,
     "free impact": FreeImpact,
     "from nothing": FromNothing,
     "joint": Joint,
@@ -64,8 +68,10 @@ KINDS: dict[str, Any] = {
     "pair": Pair,
     "paper's body": PaperBody,
     "paper's contact": PaperContact,
+    "residual body": ResidualBody,
     "response": Response,
     "rule": Rule,
+    "soft contact": SoftContact,
     "soft contacts": SoftContacts,
     "size": Size,
     "sphere": Sphere,
@@ -120,7 +126,7 @@ def unflatten(arrays: Mapping[str, np.ndarray]) -> Weights:
     """Weights from named arrays."""
     tree = unflatten_dict({name: jnp.asarray(array) for name, array in arrays.items()}, sep=":")
     seen = ({name: Statistics(**each) for name, each in tree.get(group, {}).items()} for group in ("inputs", "outputs"))
-    return Weights(tree["networks"], *seen)
+    return Weights(tree.get("networks", {}), *seen)
 
 
 def save(
@@ -194,7 +200,7 @@ def load(manifest: Path, scene: Scene | None, partly: bool = False) -> tuple[Mod
     return model, unflatten(arrays), content
 
 
-def scene_of(parts: Sequence[BodyPart | PairPart]) -> Scene:
+def scene_of(parts: Sequence[ModelledBody | ModelledPair]) -> Scene:
     """The scene that parts were made for."""
     bodies = tuple(body for part in parts if not hasattr(part, "pair") for body in bodies_of(part))
     order = [body.name for body in bodies]
@@ -204,8 +210,10 @@ def scene_of(parts: Sequence[BodyPart | PairPart]) -> Scene:
     return Scene(bodies, tuple(named), **said)
 
 
-def differences(part: BodyPart | PairPart, scene: Scene, trained: Mapping[str, Trained]) -> Iterator[str]:
+def differences(part: ModelledBody | ModelledPair, scene: Scene, trained: Mapping[str, Trained]) -> Iterator[str]:
     """In what the scene, where it needs the part, is not what that was trained for, each in a few words."""
+    if isinstance(part, ResidualBody | FreeBall | SoftContact) and not part.networks():
+        return  # physics alone, of any body
     for own in bodies_of(part):
         for body in scene.bodies:
             if body.kind == own.kind:

@@ -27,7 +27,7 @@ WEIGHTS = "human_ball"
 # Candidates that MuJoCo rolls out side by side: few, for a small budget's sake.
 ROWS = 8
 
-DynamicsName = Literal["larp", "mujoco"]
+DynamicsName = Literal["larp", "physics", "mujoco"]
 
 
 class Models(NamedTuple):
@@ -44,7 +44,9 @@ class Models(NamedTuple):
         See `larp_model.evaluation.novelty`.
         """
         simulator = self.whole.dynamics if isinstance(self.whole, Continued) else self.whole
-        return evaluation.novelty(simulator, states, controls) if isinstance(simulator, Simulator) else None
+        if not (isinstance(simulator, Simulator) and simulator.weights.networks):
+            return None
+        return evaluation.novelty(simulator, states, controls)
 
 
 def shipped(scene: Scene, embedded: bool) -> Path:
@@ -56,12 +58,15 @@ def shipped(scene: Scene, embedded: bool) -> Path:
 def models_of(scene: Scene, name: DynamicsName, weights: Path, substeps: int = SUBSTEPS, rows: int = ROWS) -> Models:
     """The planners' models; that of the scene goes on with the ball alone once no link can reach it any more.
 
+    larp: by these weights. physics: LARP's with nothing learned, of any human in any motion. mujoco: the truth itself.
     After the kick the human moves as it must: the shipped weights of the embedded kick leave it to those of any human.
     substeps: engine steps in a step of MuJoCo. rows: candidates that it rolls out side by side.
     """
     if name == "mujoco":
         return _continued(scene, [MujocoDynamics(Truth(part, rows, substeps)) for part in _parts(scene)], "none")
     require_known("dynamics", name, get_args(DynamicsName))
+    if name == "physics":
+        return _continued(scene, [Simulator.of_physics(part) for part in _parts(scene)], name)
     model, learned, manifest = stored.load(weights, scene)
     found = learned_models(scene, model, learned, manifest["sha256"][:12])
     if weights != stored.SHIPPED / f"{WEIGHTS}.json":

@@ -135,10 +135,11 @@ def reconstruct(
     scene = Scene((body,), dt=DT)
     model: Dynamics
     truth: Dynamics | None = None
-    if dynamics == "larp":
-        model, truth = Simulator(*stored.load(MANIFEST, scene)[:2]), MujocoDynamics(Truth(scene, 1, SUBSTEPS))
-    else:
+    if dynamics == "mujoco":
         model = MujocoDynamics(Truth(scene, ROWS, SUBSTEPS))
+    else:
+        simulator = Simulator(*stored.load(MANIFEST, scene)[:2]) if dynamics == "larp" else Simulator.of_physics(scene)
+        model, truth = simulator, MujocoDynamics(Truth(scene, 1, SUBSTEPS))
     wanted = physical.wanted_of(scene, figure, lifted, film)
     points = physical.Seen(body, figure, lifted.proportions)
     sigma = lift.noise(film, lifted.camera)
@@ -204,7 +205,7 @@ def main(
         person: which of several, in order of appearance from 0; the one who is seen best by default.
         height: of the person (m); where it is not known, it is estimated by a camera whose position is, and taken to be
             1.75 m by any other.
-        dynamics: the planner's model: larp (learned) or mujoco.
+        dynamics: the planner's model: larp (learned), physics (nothing is learned) or mujoco.
         preset: how much the plans may cost.
         seed: of the planner's random numbers.
         out: folder for summary.json, pose.npz and pose.bvh (each a reference for tasks.kick), pose.png,

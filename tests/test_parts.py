@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from larp_model.kinematics import kinematics, morphology_of
 from larp_model.meeting import first_contacts
 from larp_model.networks import Weights
 from larp_model.parts.contact import Contact
-from larp_model.parts.part import Hits, Model, initial_weights, measure
+from larp_model.parts.part import BodyPart, Hits, Model, initial_weights, measure
 from larp_model.simulator import step
 from larp_model.truth.episodes import Episodes
 from tasks.scenarios import scenario
@@ -141,7 +141,7 @@ def test_what_two_bodies_do_to_each_other_above_the_ground_adds_up_to_nothing(ca
     def hits(states: Array, controls: Array) -> tuple[Hits, Hits]:
         seen = model.each(kinematics(model.scene, states, morphology_of(model.scene)[None]))
         free = []
-        for part, own in zip(model.bodies, seen, strict=True):
+        for part, own in zip(cast(tuple[BodyPart, ...], model.bodies), seen, strict=True):
             targets = controls[:, model.scene.motor_rows(part.body.name)]
             free.append(part.move(case.weights, own, targets, jnp.zeros_like(own.halves)).free)
         one, two = model.of(pair)

@@ -57,8 +57,8 @@ class Hits(NamedTuple):
         return Hits(jnp.zeros((*size, 6), dtype), jnp.zeros((*size, 3), dtype))
 
 
-class BodyPart(Protocol):
-    """f_d of a body."""
+class ModelledBody(Protocol):
+    """What a model knows of one body."""
 
     @property
     def body(self) -> Body: ...
@@ -70,12 +70,6 @@ class BodyPart(Protocol):
     def networks(self) -> dict[str, Perceptron]:
         """Its networks by name."""
 
-    def move(self, weights: Weights, seen: Kinematics, control: Array, torque: Array) -> Moving:
-        """The body in a step if nothing touches it; control (B, j, 3) [rad], torque (B, n, 3) [N m]."""
-
-    def respond(self, weights: Weights, seen: Kinematics, moving: Moving, hits: Hits) -> Array:
-        """Its next states (B, n, 13)."""
-
     def measure(self, seen: Kinematics, after: Array, control: Array, torque: Array) -> tuple[Measured, Velocities]:
         """Statistics of its networks, from true steps to states (B, n, 13).
 
@@ -83,8 +77,18 @@ class BodyPart(Protocol):
         """
 
 
-class PairPart(Protocol):
-    """f_c of two bodies."""
+class BodyPart(ModelledBody, Protocol):
+    """f_d of a body, whose contacts are parts of their own."""
+
+    def move(self, weights: Weights, seen: Kinematics, control: Array, torque: Array) -> Moving:
+        """The body in a step if nothing touches it; control (B, j, 3) [rad], torque (B, n, 3) [N m]."""
+
+    def respond(self, weights: Weights, seen: Kinematics, moving: Moving, hits: Hits) -> Array:
+        """Its next states (B, n, 13)."""
+
+
+class ModelledPair(Protocol):
+    """What a model knows of two bodies that can touch."""
 
     @property
     def bodies(self) -> tuple[Body, Body]: ...
@@ -92,13 +96,17 @@ class PairPart(Protocol):
     def networks(self) -> dict[str, Perceptron]:
         """Its networks by name."""
 
+    def measure(self, seen: tuple[Kinematics, Kinematics], free: tuple[Velocities, Velocities]) -> Measured:
+        """Statistics of its networks; where links are near, for elsewhere they are not heard."""
+
+
+class PairPart(ModelledPair, Protocol):
+    """f_c of two bodies."""
+
     def meet(
         self, weights: Weights, seen: tuple[Kinematics, Kinematics], free: tuple[Velocities, Velocities]
     ) -> tuple[Hits, Hits]:
         """What the two bodies do to each other."""
-
-    def measure(self, seen: tuple[Kinematics, Kinematics], free: tuple[Velocities, Velocities]) -> Measured:
-        """Statistics of its networks; where links are near, for elsewhere they are not heard."""
 
 
 @dataclass(frozen=True)
@@ -106,11 +114,11 @@ class Model:
     """A scene and its parts, in the order of its bodies and pairs. Static under jit."""
 
     scene: Scene
-    bodies: tuple[BodyPart, ...]
-    pairs: tuple[PairPart, ...]
+    bodies: tuple[ModelledBody, ...]
+    pairs: tuple[ModelledPair, ...]
 
     @property
-    def parts(self) -> tuple[BodyPart | PairPart, ...]:
+    def parts(self) -> tuple[ModelledBody | ModelledPair, ...]:
         """All parts."""
         return (*self.bodies, *self.pairs)
 
@@ -131,7 +139,7 @@ class Model:
         """The same parts in a scene of bodies of the same kinds, or of some of them."""
         return assemble(scene, self.parts)
 
-    def of(self, pair: PairPart) -> tuple[int, int]:
+    def of(self, pair: ModelledPair) -> tuple[int, int]:
         """Which bodies a pair is of."""
         first, second = (self.scene.bodies.index(body) for body in pair.bodies)
         return first, second
@@ -178,7 +186,7 @@ def name_of(*bodies: Body) -> str:
     return "-".join(body.kind for body in bodies)
 
 
-def bodies_of(part: BodyPart | PairPart) -> tuple[Body, ...]:
+def bodies_of(part: ModelledBody | ModelledPair) -> tuple[Body, ...]:
     """The body or the two bodies that a part is of."""
     return part.bodies if hasattr(part, "bodies") else (part.body,)
 
@@ -190,7 +198,7 @@ def ordered(scene: Scene) -> Iterator[tuple[Pair, tuple[Body, Body]]]:
         yield (pair, (first, second)) if first.kind <= second.kind else (pair.flipped(), (second, first))
 
 
-def assemble(scene: Scene, parts: Sequence[BodyPart | PairPart]) -> Model:
+def assemble(scene: Scene, parts: Sequence[ModelledBody | ModelledPair]) -> Model:
     """The model of a scene from those parts that it needs, found by the kinds of their bodies."""
     known = {name_of(*bodies_of(part)): part for part in parts}
 

@@ -1,1 +1,1 @@
-"""Physics that needs no learning: see `articulated` and `contact`."""
+"""Physics that needs no learning: see `step`."""

@@ -103,7 +103,7 @@ def main(
         targets: how many kicks.
         seed: of targets, ball spots and planner.
         preset: fast, balanced or accurate.
-        dynamics: the planner's model: larp or mujoco.
+        dynamics: the planner's model: larp, physics or mujoco.
         json: where the figures go; the picture goes beside them.
         weights: manifest of the weights of the learned model; those shipped for the kick by default.
         reference: a captured kick (BVH) instead of the embedded one.

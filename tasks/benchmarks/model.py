@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from larp_model import designs, evaluation
+from larp_model import evaluation
 from larp_model import weights as stored
 from larp_model.designs import DesignName
 from larp_model.errors import InputError
@@ -88,7 +88,7 @@ def main(
         bodies: varied draws another human for every episode.
         beside: weights of this design, from where `tasks.train --design` leaves them, on the same episodes.
         bullet: also how far Bullet, the second truth, strays from the first.
-        untrained: the hybrid design as it is, all its networks zero: physics alone.
+        untrained: physics alone, with nothing learned.
         publish: put the table into RESULTS.md.
     """
     if untrained and weights:
@@ -143,8 +143,7 @@ def main(
 def judged(manifest: Path | None, chosen: Scenario, episodes: Episodes) -> dict[str, Any]:
     """Return errors of some weights, or of physics alone (see `evaluation.evaluate`), and the time of a step."""
     if manifest is None:
-        model = designs.hybrid(chosen.scene)
-        simulator = Simulator(model, stored.untrained(model))
+        simulator = Simulator.of_physics(chosen.scene)
     else:
         simulator = Simulator(*stored.load(manifest, chosen.scene)[:2])
     found = evaluation.evaluate(simulator, episodes, chosen.windows)

@@ -1,0 +1,153 @@
+"""Which links of a scene can touch in a step, how near they come, and where they are closest.
+
+Arrays have the batch last, as in `mechanics`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from larp_model.contact import Axis, nearest
+from larp_model.mechanics import cross
+from larp_model.scene import Scene, Surface
+from larp_model.vector import Vector
+
+
+@dataclass(frozen=True)
+class Rule:
+    """How finely contacts are integrated.
+
+    contacts: how many pairs of links, the nearest, are looked at. substeps: of a step. iterations: of Newton's method.
+    fade: time [s] within which servos take back what links have gained, see `response`. margin: links touch within a
+    step where their gap falls below this [m]. moments: so often in a step their gap is looked at.
+    """
+
+    contacts: int = 2
+    substeps: int = 10
+    iterations: int = 4
+    fade: float = 0.003
+    margin: float = 0.005
+    moments: int = 5
+
+
+class Links(NamedTuple):
+    """All links of a scene in a step: position, half axis [m], velocity and spin when it begins, (L, 3, B) each.
+
+    acceleration, turning: mean ones [m/s^2, rad/s^2] if nothing touches. uncounted, uncounted_turning: accelerations
+    that contacts do not count, see `mechanics.velocity_products`. sizes: (L, 3, B).
+    """
+
+    position: Array
+    half: Array
+    velocity: Array
+    spin: Array
+    acceleration: Array
+    turning: Array
+    uncounted: Array
+    uncounted_turning: Array
+    sizes: Array
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Which pairs of links of a scene can touch, and its balls."""
+
+    scene: Scene
+
+    @cached_property
+    def rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the rows of both links of every pair of links, (P,) each."""
+        rows = [
+            (self.scene.index(pair.first, first), self.scene.index(pair.second, second))
+            for pair in self.scene.pairs
+            for first in pair.first_links
+            for second in pair.second_links
+        ]
+        first, second = np.array(rows, int).reshape(-1, 2).T
+        return first, second
+
+    @cached_property
+    def surfaces(self) -> tuple[Surface, ...]:
+        """Return the surface of every pair of links."""
+        counts = [(pair.surface, len(pair.first_links) * len(pair.second_links)) for pair in self.scene.pairs]
+        return tuple(surface for surface, count in counts for _ in range(count))
+
+    @cached_property
+    def balls(self) -> tuple[str, ...]:
+        """Return the names of the balls."""
+        return tuple(body.name for body in self.scene.bodies if body.is_ball)
+
+    def gaps(self, links: Links, dt: float, rule: Rule) -> Array:
+        """Return the smallest gap (P, B) [m] of every pair within a step in which nothing touches."""
+        first, second = self.rows
+
+        def at(time: Array) -> Array:
+            swept = time * (links.velocity + 0.5 * time * links.acceleration)
+            half = turned(links.half, time * (links.spin + 0.5 * time * links.turning))
+            one, two = (((links.position + swept)[rows], half[rows], links.sizes[rows, 1]) for rows in (first, second))
+            return closest(one, two)[1]
+
+        times = jnp.linspace(0.0, dt, rule.moments, dtype=links.position.dtype)
+        return jnp.min(jax.lax.map(at, times), axis=0)
+
+
+class Sides(NamedTuple):
+    """The S links of K contacts and nb balls on the ground: K first links, K second links, the balls.
+
+    which: (S, L, B) one-hot. owners: names of the bodies that each can be of.
+    """
+
+    which: Array
+    owners: tuple[frozenset[str], ...]
+
+    def of(self, values: Array, rows: slice = slice(None)) -> Array:
+        """Return what values (L, ..., B) say of the sides, (S, ..., B)."""
+        return picked(self.which[:, rows], values)
+
+
+def sides_of(candidates: Candidates, chosen: Array) -> Sides:
+    scene, (first, second) = candidates.scene, candidates.rows
+    every = np.eye(len(scene.links))
+    of_links = [picked(chosen, jnp.asarray(every[rows], chosen.dtype)[..., None]) for rows in (first, second)]
+    batch = chosen.shape[-1]
+    of_balls = [
+        jnp.broadcast_to(jnp.asarray(every[scene.rows(name)], chosen.dtype)[..., None], (1, len(every), batch))
+        for name in candidates.balls
+    ]
+    firsts, seconds = (frozenset(getattr(pair, end) for pair in scene.pairs) for end in ("first", "second"))
+    owners = (*[firsts] * len(chosen), *[seconds] * len(chosen), *(frozenset([name]) for name in candidates.balls))
+    return Sides(jnp.concatenate([*of_links, *of_balls]), owners)
+
+
+def closest(first: tuple[Array, Array, Array], second: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    """Return normals (n, 3, B), gaps (n, B) and contact points (n, 3, B) of capsules (centre, half axis, radius)."""
+    one, two = (Axis(_vector(centre), _vector(half), radius) for centre, half, radius in (first, second))
+    normal, gap, point, _ = nearest(one, two)
+    along, at = (jnp.stack([each.x, each.y, each.z], axis=1) for each in (normal, point))
+    return along, gap, at
+
+
+def _vector(vectors: Array) -> Vector:
+    return Vector(vectors[:, 0], vectors[:, 1], vectors[:, 2])
+
+
+def turned(vector: Array, by: Array) -> Array:
+    """Return vectors (n, 3, B) turned by small rotation vectors (n, 3, B) [rad], to the second order."""
+    once = cross(by, vector)
+    return vector + once + 0.5 * cross(by, once)
+
+
+def picked(which: Array, values: Array) -> Array:
+    """Return (S, ..., B) what one-hot rows (S, L, B) take of values (L, ..., B or 1)."""
+    rows = which.reshape(*which.shape[:2], *[1] * (values.ndim - 2), which.shape[-1])
+    total = rows[:, 0] * values[0]
+    for row in range(1, len(values)):
+        total += rows[:, row] * values[row]
+    return total
