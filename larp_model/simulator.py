@@ -65,11 +65,11 @@ def _over_physics(model: Model, weights: Weights, state: Array, control: Array, 
     """Return the states after a step of physics, in which networks correct how bodies move by themselves."""
     scene, parts = model.scene, {part.body.name: part for part in model.bodies}
 
-    def correct(body: Body, before: Array, motion: BodyMotion, dt: float) -> BodyMotion:
+    def correct(body: Body, before: Array, own: Array, motion: BodyMotion, dt: float) -> BodyMotion:
         part = parts[body.name]
         if not isinstance(part, ResidualBody) or part.size is None:
             return motion
-        seen = kinematics(scene.only(body.name), jnp.moveaxis(before, -1, 0), sizes[:, scene.rows(body.name)])
+        seen = kinematics(scene.only(body.name), *(jnp.moveaxis(each, -1, 0) for each in (before, own)))
         corrected = part.corrected(weights, seen, BodyMotion(*(jnp.moveaxis(each, -1, 0) for each in motion)), dt)
         return BodyMotion(*(jnp.moveaxis(each, 0, -1) for each in corrected))
 

@@ -14,8 +14,10 @@ from larp_model import launches
 from larp_model import state as packed
 from larp_model.bodies import ball, two_balls
 from larp_model.physics import contact
+from larp_model.physics import step as physics
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
+from larp_model.simulator import step as simulator_step
 from larp_model.truth.mujoco import Truth
 from tasks.data import random_episodes
 from tasks.motions.references import Reference
@@ -164,9 +166,19 @@ def test_balls_that_meet_keep_their_momentum(meeting_balls: np.ndarray) -> None:
     assert struck[:-1].all() and not struck[-1], "m/s"
 
 
-def test_a_scene_moves_alike_alone_and_beside_others(meeting_balls: np.ndarray) -> None:
+def test_a_scene_moves_alike_alone_and_beside_others(
+    meeting_balls: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
     simulator, controls = Simulator.of_physics(two_balls()), np.zeros((6, 4, 0, 3))
     together = np.asarray(simulator.rollout(meeting_balls, controls))
+    # Scenes are worked on in chunks, those that touch first.
+    monkeypatch.setattr(physics, "CHUNK", 4)
+    shuffled, states = [5, 0, 3, 1, 4, 2], jnp.asarray(meeting_balls, jnp.float32)
+    chunked = jax.jit(
+        lambda state: simulator_step(simulator.model, simulator.weights, state, jnp.asarray(controls[:, 0]))
+    )
+    found = chunked(chunked(chunked(chunked(states[np.array(shuffled)]))))
+    np.testing.assert_allclose(found, together[shuffled, -1], atol=1e-4)
     for row in (0, 5):
         alone = np.asarray(simulator.rollout(meeting_balls[[row] * 6], controls))[0]
         np.testing.assert_allclose(together[row], alone, atol=1e-5)

@@ -6,12 +6,15 @@ Where links touch within a step, the scene's step is made of two halves, each wi
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from larp_model import state as packed
+from larp_model.compliance import moments
 from larp_model.mechanics import (
     Articulation,
     BodyMotion,
@@ -27,50 +30,56 @@ from larp_model.physics.collision import Candidates, Links, Rule
 from larp_model.physics.impact import integrate
 from larp_model.scene import Body, Scene
 
-Correction = Callable[[Body, Array, BodyMotion, float], BodyMotion]
-"""(body, its states (n, 13, B), its motion with the batch last, dt [s]) -> its motion, as a network knows better."""
+# Scenes in which links touch are worked on so many side by side: more do not fit into the caches of a core.
+CHUNK = 64
+
+
+class Given(NamedTuple):
+    """States (L, 13, B) before a step, targets (J, 3, B) [rad], torques (L, 3, B) [N m], and sizes (L, 3, B)."""
+
+    state: Array
+    targets: Array
+    torques: Array
+    sizes: Array
+
+
+Correction = Callable[[Body, Array, Array, BodyMotion, float], BodyMotion]
+"""(body, states (n, 13, B), sizes (n, 3, B), motion (n, 3, B) each, dt [s]) -> motion, as a network knows better."""
 
 
 def step(
     scene: Scene, state: Array, control: Array, torque: Array, morphology: Array,
     constants: Mapping[str, Constants], rule: Rule,
-    correct: Correction = lambda body, state, motion, dt: motion,
+    correct: Correction = lambda body, state, sizes, motion, dt: motion,
 ) -> Array:  # fmt: skip
     """Return states (B, L, 13) one `scene.dt` after states (B, L, 13).
 
     control (B, J, 3) [rad], torque (B, L, 3) [N m], morphology (B or 1, L, 3). constants: of the articulated bodies, by
     name. correct: see `Correction`.
     """
-    before, targets, outside = (jnp.moveaxis(each, 0, -1) for each in (state, control, torque))
+    before, targets, torques = (jnp.moveaxis(each, 0, -1) for each in (state, control, torque))
     sizes = jnp.broadcast_to(jnp.moveaxis(morphology, 0, -1), (len(scene.links), 3, state.shape[0]))
+    given, candidates = Given(before, targets, torques, sizes), Candidates(scene)
 
-    def free(before: Array, dt: float) -> tuple[BodyMotion, dict[str, Articulation]]:
+    def free(given: Given, dt: float) -> tuple[BodyMotion, dict[str, Articulation]]:
         motions, articulations = [], {}
         for body in scene.bodies:
             rows = scene.rows(body.name)
-            own = before[rows], outside[rows], sizes[rows]
+            state, torques, sizes = given.state[rows], given.torques[rows], given.sizes[rows]
             if body.is_ball:
-                motion = ball_motion(body, *own, scene.gravity, dt)
+                motion = ball_motion(body, state, torques, sizes, scene.gravity, dt)
             else:
-                aims = targets[scene.motor_rows(body.name)]
+                aims = given.targets[scene.motor_rows(body.name)]
                 motion, articulations[body.name] = articulated_motion(
-                    body, own[0], aims, *own[1:], scene.gravity, dt, constants[body.name]
+                    body, state, aims, torques, sizes, scene.gravity, dt, constants[body.name]
                 )
-            motions.append(correct(body, before[rows], motion, dt))
+            motions.append(correct(body, state, sizes, motion, dt))
         return BodyMotion(*(jnp.concatenate(each) for each in zip(*motions, strict=True))), articulations
 
-    alone, articulations = free(before, scene.dt)
-    after = _after(before, alone)
-    if not scene.pairs:
-        return jnp.moveaxis(after, -1, 0)
-    candidates = Candidates(scene)
-    gaps = candidates.gaps(_links(scene, before, outside, sizes, alone, articulations, scene.dt), scene.dt, rule)
-    near = jnp.min(gaps, axis=0) < rule.margin
-
-    def half(before: Array, nothing: None) -> tuple[Array, None]:
+    def half(given: Given, nothing: None) -> tuple[Given, None]:
         dt = 0.5 * scene.dt
-        motion, articulations = free(before, dt)
-        links = _links(scene, before, outside, sizes, motion, articulations, dt)
+        motion, articulations = free(given, dt)
+        links = _links(scene, given, motion, articulations, dt)
         # Balls are integrated with all that touches them, the ground as well.
         balls = jnp.concatenate([jnp.full(len(body.links), body.is_ball) for body in scene.bodies])[:, None, None]
         flying = BodyMotion(
@@ -79,33 +88,55 @@ def step(
         )  # fmt: skip
         motion = BodyMotion(*(jnp.where(balls, fly, own) for fly, own in zip(flying, motion, strict=True)))
         gained = integrate(scene, links, articulations, candidates.gaps(links, dt, rule), dt, rule)
-        return _after(before, BodyMotion(*(own + more for own, more in zip(motion, gained, strict=True)))), None
+        both = BodyMotion(*(own + more for own, more in zip(motion, gained, strict=True)))
+        return given._replace(state=_after(given.state, both)), None
 
-    def struck() -> Array:
-        finely, _ = jax.lax.scan(half, before, length=2)
-        return jnp.where(near, finely, after)
+    motion, articulations = free(given, scene.dt)
+    after = _after(before, motion)
+    if scene.pairs:
+        gaps = candidates.gaps(_links(scene, given, motion, articulations, scene.dt), scene.dt, rule)
+        near = jnp.min(gaps, axis=0) < rule.margin
+        after = _where(near, lambda given: jax.lax.scan(half, given, length=2)[0].state, given, after)
+    return jnp.moveaxis(after, -1, 0)
 
-    return jnp.moveaxis(jax.lax.cond(jnp.any(near), struck, lambda: after), -1, 0)
+
+def _where(near: Array, finely: Callable[[Given], Array], given: Given, otherwise: Array) -> Array:
+    """Return states (L, 13, B) by `finely` where near (B,), chunk by chunk, and the other states elsewhere."""
+    count = near.shape[0]
+    size = min(CHUNK, count)
+    order = jnp.argsort(~near)
+    rows = order[np.minimum(np.arange(count + -count % size), count - 1)].reshape(-1, size)
+
+    def chunk(nothing: None, rows: Array) -> tuple[None, Array]:
+        own: Given = jax.tree.map(lambda each: each[..., rows], given)
+        return None, jax.lax.cond(jnp.any(near[rows]), finely, lambda given: given.state, own)
+
+    if len(rows) == 1:
+        found = jax.lax.cond(jnp.any(near), finely, lambda given: given.state, given)
+    else:
+        _, chunks = jax.lax.scan(chunk, None, rows)
+        found = jnp.moveaxis(chunks, 0, -2).reshape(*otherwise.shape[:2], -1)[..., jnp.argsort(order)]
+    return jnp.where(near, found, otherwise)
 
 
-def _links(
-    scene: Scene, before: Array, outside: Array, sizes: Array, motion: BodyMotion,
-    articulations: dict[str, Articulation], dt: float,
-) -> Links:  # fmt: skip
+def _links(scene: Scene, given: Given, motion: BodyMotion, articulations: dict[str, Articulation], dt: float) -> Links:
     """Return all links of a scene whose bodies move so within `dt` [s]; balls as if in the air."""
     position, orientation, velocity, spin = (
-        before[:, columns]
+        given.state[:, columns]
         for columns in (packed.POSITION, packed.ORIENTATION, packed.VELOCITY, packed.ANGULAR_VELOCITY)
     )
-    axes = jnp.array([link.axis for link in scene.links], before.dtype)[..., None]
-    half = 0.5 * sizes[:, :1] * mv(turns(orientation), axes)
+    axes = jnp.array([link.axis for link in scene.links], given.state.dtype)[..., None]
+    half = 0.5 * given.sizes[:, :1] * mv(turns(orientation), axes)
     acceleration, turning = (motion.velocity - velocity) / dt, (motion.spin - spin) / dt
     uncounted, uncounted_turning = [], []
-    down = jnp.array([0.0, 0.0, -scene.gravity], before.dtype)[None, :, None]
+    down = jnp.array([0.0, 0.0, -scene.gravity], given.state.dtype)[None, :, None]
     for body in scene.bodies:
         rows = scene.rows(body.name)
         if body.is_ball:
+            sizes = given.sizes[rows]
+            inertia = moments(sizes[:, 0], sizes[:, 1], sizes[:, 2])[0][:, None]
             acceleration = acceleration.at[rows].set(jnp.broadcast_to(down, acceleration[rows].shape))
+            turning = turning.at[rows].set(given.torques[rows] / inertia)
         if body.joints:
             linear, angular = velocity_products(body, articulations[body.name].tied, spin[rows])
         else:
@@ -114,7 +145,7 @@ def _links(
         uncounted_turning.append(angular)
     uncounted_all, uncounted_turning_all = jnp.concatenate(uncounted), jnp.concatenate(uncounted_turning)
     return Links(
-        position, half, velocity, spin, acceleration, turning, uncounted_all, uncounted_turning_all, sizes
+        position, half, velocity, spin, acceleration, turning, uncounted_all, uncounted_turning_all, given.sizes
     )  # fmt: skip
 
 
