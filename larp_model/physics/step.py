@@ -31,7 +31,7 @@ from larp_model.physics.impact import integrate
 from larp_model.scene import Body, Scene
 
 # Scenes in which links touch are worked on so many side by side: more do not fit into the caches of a core.
-CHUNK = 64
+CHUNK = 32
 
 
 class Given(NamedTuple):
