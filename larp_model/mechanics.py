@@ -505,7 +505,7 @@ class Ends(NamedTuple):
         body: Body, matrices: Array, height: Array, velocity: Array, spin: Array, sizes: Array, h: float,
         gains: tuple[Array, Array] | None = None,
     ) -> Ends:  # fmt: skip
-        """Of links that are so turned (n, 3, 3, B), so high (n, 1, B) [m] and so fast at first (n, 3, B).
+        """Return the ends of links by rotations (n, 3, 3, B), heights (n, 1, B) [m] and first velocities (n, 3, B).
 
         gains: accelerations of the links, (n, 3, B) [m/s^2] and [rad/s^2], that contacts do not count.
         """

@@ -27,7 +27,7 @@ from larp_model.names import require_known
 from larp_model.networks import Weights
 from larp_model.parts.part import BodyPart, Hits, Model, PairPart
 from larp_model.parts.residual import FreeBall, ResidualBody, SoftContact
-from larp_model.physics.collision import Rule
+from larp_model.physics.collision import ContactSettings
 from larp_model.physics.step import step as physics_step
 from larp_model.runtime import remember_compilations
 from larp_model.scene import Body, Scene
@@ -74,8 +74,9 @@ def _over_physics(model: Model, weights: Weights, state: Array, control: Array, 
         return BodyMotion(*(jnp.moveaxis(each, 0, -1) for each in corrected))
 
     constants = {name: part.constants for name, part in parts.items() if isinstance(part, ResidualBody)}
-    rules = [part.rule for part in model.pairs if isinstance(part, SoftContact)]
-    return physics_step(scene, state, control, torque, sizes, constants, (rules or [Rule()])[0], correct)
+    found = (part.settings for part in model.pairs if isinstance(part, SoftContact))
+    settings = next(found, ContactSettings())
+    return physics_step(scene, state, control, torque, sizes, constants, settings, correct)
 
 
 def pooled(model: Model, weights: Weights, seen: list[Kinematics], free: list[Velocities]) -> list[Hits]:

@@ -41,7 +41,7 @@ from larp_model.parts.part import (
 )
 from larp_model.parts.residual import FreeBall, ResidualBody, SoftContact
 from larp_model.parts.sphere import Sphere
-from larp_model.physics.collision import Rule as ContactRule
+from larp_model.physics.collision import ContactSettings
 from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface
 from larp_model.soft_contact import Rule
 
@@ -55,7 +55,7 @@ KINDS: dict[str, Any] = {
     "articulated": Articulated,
     "body": Body,
     "contact": Contact,
-    "contact rule": ContactRule,
+    "contact settings": ContactSettings,
     "free ball": FreeBall,
     "free impact": FreeImpact,
     "from nothing": FromNothing,

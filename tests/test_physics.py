@@ -43,7 +43,7 @@ def wanted(in_64_bits: None) -> tuple[Array, Array]:
 
 
 @pytest.fixture
-def problem(in_64_bits: None) -> contact.Problem:
+def problem(in_64_bits: None) -> contact.ContactProblem:
     """Contacts of bodies of about 1 kg that meet at about 1 m/s, some of them open."""
     random = np.random.default_rng(0)
     factor = random.standard_normal((BATCH, 3 * CONTACTS, 3 * CONTACTS))
@@ -51,7 +51,7 @@ def problem(in_64_bits: None) -> contact.Problem:
     velocity, reference, normal = random.standard_normal((3, CONTACTS, 3, BATCH))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     each = np.ones((CONTACTS, 1, BATCH))
-    return contact.Problem(
+    return contact.ContactProblem(
         *map(
             jnp.asarray,
             (
@@ -91,14 +91,14 @@ def test_slopes_of_impulses_are_their_derivatives_symmetric_and_not_negative(wan
     assert np.linalg.eigvalsh(slope[..., 0]).min() > -1e-9
 
 
-def test_all_contacts_obey_the_law_together(problem: contact.Problem) -> None:
+def test_all_contacts_obey_the_law_together(problem: contact.ContactProblem) -> None:
     impulses = impulses_of(problem, jnp.zeros_like(problem.velocity), 30)
     called = problem.wanted_impulses(problem.after(impulses))
     np.testing.assert_allclose(impulses, called, atol=1e-6)
     assert (jnp.abs(impulses).max(axis=1) > 0.01).any() and (impulses == 0.0).all(axis=1).any()
 
 
-def test_impulses_have_the_derivatives_of_their_differences(problem: contact.Problem) -> None:
+def test_impulses_have_the_derivatives_of_their_differences(problem: contact.ContactProblem) -> None:
     def impulses(share: Array) -> Array:
         moved = problem._replace(
             velocity=problem.velocity + share * problem.reference,

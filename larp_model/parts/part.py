@@ -58,7 +58,7 @@ class Hits(NamedTuple):
 
 
 class ModelledBody(Protocol):
-    """What a model knows of one body."""
+    """The part of a model for one body."""
 
     @property
     def body(self) -> Body: ...
@@ -88,7 +88,7 @@ class BodyPart(ModelledBody, Protocol):
 
 
 class ModelledPair(Protocol):
-    """What a model knows of two bodies that can touch."""
+    """The part of a model for two bodies that can touch."""
 
     @property
     def bodies(self) -> tuple[Body, Body]: ...

@@ -18,7 +18,7 @@ from larp_model.meeting import Velocities
 from larp_model.networks import Measured, Perceptron, Size, Statistics, Weights, bounded, evaluate, side_by_side
 from larp_model.parts.articulated import changes_between, changes_of, to_world
 from larp_model.parts.part import name_of
-from larp_model.physics.collision import Rule
+from larp_model.physics.collision import ContactSettings
 from larp_model.scene import Body, Pair
 
 
@@ -51,8 +51,6 @@ class ResidualBody:
 
     def corrected(self, weights: Weights, seen: Kinematics, motion: BodyMotion, dt: float) -> BodyMotion:
         """Return the motion within `dt` [s], (B, n, 3), as the network knows better."""
-        if self.size is None:
-            return motion
         turn, inputs = self._inputs(seen, motion, dt)
         outputs = bounded(evaluate(self.networks()[self.name], weights, self.name, inputs), self.bound)
         # Of a shorter step it is that share.
@@ -118,7 +116,7 @@ class SoftContact:
     pair: Pair
     dt: float
     gravity: float
-    rule: Rule = field(default_factory=Rule)
+    settings: ContactSettings = field(default_factory=ContactSettings)
 
     def networks(self) -> dict[str, Perceptron]:
         """See `PairPart`."""

@@ -1,4 +1,4 @@
-"""Which links of a scene can touch in a step, how near they come, and where they are closest.
+"""Pairs of links that can touch in a step: their smallest gaps, and their closest points.
 
 Arrays have the batch last, as in `mechanics`.
 """
@@ -21,8 +21,8 @@ from larp_model.vector import Vector
 
 
 @dataclass(frozen=True)
-class Rule:
-    """How finely contacts are integrated.
+class ContactSettings:
+    """Settings of the contact solver and of its integration in time.
 
     contacts: how many pairs of links, the nearest, are looked at. substeps: of a step. iterations: of Newton's method.
     fade: time [s] within which servos take back what links have gained, see `response`. margin: links touch within a
@@ -57,7 +57,7 @@ class Links(NamedTuple):
 
 @dataclass(frozen=True)
 class Candidates:
-    """Which pairs of links of a scene can touch, and its balls."""
+    """Pairs of links of a scene that can touch, and its balls."""
 
     scene: Scene
 
@@ -84,7 +84,7 @@ class Candidates:
         """Return the names of the balls."""
         return tuple(body.name for body in self.scene.bodies if body.is_ball)
 
-    def gaps(self, links: Links, dt: float, rule: Rule) -> Array:
+    def gaps(self, links: Links, dt: float, settings: ContactSettings) -> Array:
         """Return the smallest gap (P, B) [m] of every pair within a step in which nothing touches."""
         first, second = self.rows
 
@@ -94,7 +94,7 @@ class Candidates:
             one, two = (((links.position + swept)[rows], half[rows], links.sizes[rows, 1]) for rows in (first, second))
             return closest(one, two)[1]
 
-        times = jnp.linspace(0.0, dt, rule.moments, dtype=links.position.dtype)
+        times = jnp.linspace(0.0, dt, settings.moments, dtype=links.position.dtype)
         return jnp.min(jax.lax.map(at, times), axis=0)
 
 
@@ -107,12 +107,13 @@ class Sides(NamedTuple):
     which: Array
     owners: tuple[frozenset[str], ...]
 
-    def of(self, values: Array, rows: slice = slice(None)) -> Array:
-        """Return what values (L, ..., B) say of the sides, (S, ..., B)."""
-        return picked(self.which[:, rows], values)
+    def of(self, values: Array) -> Array:
+        """Return the sides' values (S, ..., B), out of those of all links (L, ..., B)."""
+        return picked(self.which, values)
 
 
 def sides_of(candidates: Candidates, chosen: Array) -> Sides:
+    """Return the sides of the pairs of links chosen by one-hot rows (K, P, B), and of all balls."""
     scene, (first, second) = candidates.scene, candidates.rows
     every = np.eye(len(scene.links))
     of_links = [picked(chosen, jnp.asarray(every[rows], chosen.dtype)[..., None]) for rows in (first, second)]

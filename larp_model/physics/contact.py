@@ -34,7 +34,7 @@ from larp_model.mechanics import held, invert, mm, mv
 SHARES = (0.015625, 0.0625, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0)
 
 
-class Problem(NamedTuple):
+class ContactProblem(NamedTuple):
     """C contacts: the module's u_free (C, 3, B) [m/s], A (C, C, 3, 3, B) [1/kg], u_ref (C, 3, B) [m/s] and m (C, 1, B).
 
     normal: (C, 3, B). friction: coefficients (C, 1, B or 1). active: (C, 1, B) 1 where there is contact, else 0.
@@ -66,7 +66,7 @@ class Problem(NamedTuple):
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(2,))
-def impulses_of(problem: Problem, guess: Array, iterations: int) -> Array:
+def impulses_of(problem: ContactProblem, guess: Array, iterations: int) -> Array:
     """Return the impulses J (C, 3, B) [N s] of all contacts by so many Newton iterations; see the module."""
 
     def newton(found: tuple[Array, Array], nothing: None) -> tuple[tuple[Array, Array], None]:
@@ -86,7 +86,7 @@ def impulses_of(problem: Problem, guess: Array, iterations: int) -> Array:
 
 @impulses_of.defjvp
 def _impulses_jvp(
-    iterations: int, primals: tuple[Problem, Array], tangents: tuple[Problem, Array]
+    iterations: int, primals: tuple[ContactProblem, Array], tangents: tuple[ContactProblem, Array]
 ) -> tuple[Array, Array]:
     problem, guess = primals
     impulses = impulses_of(problem, guess, iterations)
@@ -97,7 +97,7 @@ def _impulses_jvp(
     return impulses, change - mv(mass, solved(_matrix(problem.admittance, mass), still.after(change)))
 
 
-def _one_by_one(problem: Problem, guess: Array) -> Array:
+def _one_by_one(problem: ContactProblem, guess: Array) -> Array:
     """Return impulses (C, 3, B) of every contact where the others are as guessed: see `stuck_or_sliding`.
 
     Of its admittance across the normal the mean of all directions counts.
@@ -195,7 +195,7 @@ def _matrix(admittance: Array, mass: Array) -> list[list[Array]]:
     return [[blocks[count * i + j : count * i + j + 1] + (unit if i == j else 0.0) for j in rows] for i in rows]
 
 
-def _line_search(problem: Problem, velocities: tuple[Array, Array], impulses: tuple[Array, Array]) -> Array:
+def _line_search(problem: ContactProblem, velocities: tuple[Array, Array], impulses: tuple[Array, Array]) -> Array:
     """Return the share (B,) of a Newton step that makes the cost of the convex problem least.
 
     The cost's slope along the step is the change of velocities times what the impulses, which the velocities come from,

@@ -1,4 +1,4 @@
-"""What contacts of links with links, and of balls with the ground, do within a step: integrated in contact space.
+"""Contacts of links with links, and of balls with the ground, within a step: integrated in contact space.
 
 Bodies move on as if nothing touched them, but for the ground that carries articulated bodies, and respond to impulses
 linearly (`response`). So a step's contacts are solved for between the few links that touch, in substeps, by the law of
@@ -21,8 +21,8 @@ from larp_model.compliance import moments
 from larp_model.contact import IMPEDANCE
 from larp_model.mechanics import Articulation, Momenta, cross
 from larp_model.physics import contact
-from larp_model.physics.collision import Candidates, Links, Rule, Sides, closest, picked, sides_of, turned
-from larp_model.physics.contact import Problem
+from larp_model.physics.collision import Candidates, ContactSettings, Links, Sides, closest, picked, sides_of, turned
+from larp_model.physics.contact import ContactProblem
 from larp_model.physics.response import responses
 from larp_model.scene import Scene, Surface
 
@@ -30,7 +30,7 @@ UP = np.array([0.0, 0.0, 1.0])[None, :, None]
 
 
 class Gained(NamedTuple):
-    """What contacts add to all links in a step, (L, 3, B) each.
+    """Changes that contacts add to all links in a step, (L, 3, B) each.
 
     velocity [m/s] and spin [rad/s] at its end; moved [m] and turned [rad] during it.
     """
@@ -41,7 +41,7 @@ class Gained(NamedTuple):
     turned: Array
 
 
-class Moves(NamedTuple):
+class SideStates(NamedTuple):
     """The sides in a substep, (S, 3, B) each, and (C, 3, B) impulses of the one before.
 
     fading, fading_turning: the part of velocity and spin that servos take back.
@@ -64,22 +64,27 @@ Totals = tuple[tuple[Array, Array], tuple[Array, Array]]
 
 
 def integrate(
-    scene: Scene, links: Links, articulations: dict[str, Articulation], gaps: Array, dt: float, rule: Rule
+    scene: Scene,
+    links: Links,
+    articulations: dict[str, Articulation],
+    gaps: Array,
+    dt: float,
+    settings: ContactSettings,
 ) -> Gained:
     """Return what contacts within `dt` [s] do to all links of a scene; see the module.
 
     articulations: of the articulated bodies by name. gaps: (P, B), see `Candidates.gaps`.
     """
     candidates = Candidates(scene)
-    count = min(rule.contacts, len(gaps))
+    count = min(settings.contacts, len(gaps))
     chosen = jax.nn.one_hot(jnp.argsort(gaps, axis=0)[:count], len(gaps), axis=1, dtype=gaps.dtype)
     sides = sides_of(candidates, chosen)
     spread = {
-        name: _spread(scene, name, articulation, sides, links.sizes, rule)
+        name: _spread(scene, name, articulation, sides, links.sizes, settings)
         for name, articulation in articulations.items()
         if any(name in owners for owners in sides.owners)
     }
-    totals = System(candidates, links, chosen, sides, spread, dt, rule).run()
+    totals = System(candidates, links, chosen, sides, spread, dt, settings).run()
     parts = []
     for body in scene.bodies:
         rows = scene.rows(body.name)
@@ -102,7 +107,7 @@ def integrate(
 
 
 def _spread(
-    scene: Scene, name: str, articulation: Articulation, sides: Sides, sizes: Array, rule: Rule
+    scene: Scene, name: str, articulation: Articulation, sides: Sides, sizes: Array, settings: ContactSettings
 ) -> tuple[list[int], tuple[Array, Array]]:
     """Return the sides that a body may be, and what its links gain by impulses there, (2, n, 3, 6 of each, B) each."""
     rows, body = scene.rows(name), scene.body(name)
@@ -111,7 +116,7 @@ def _spread(
     on = sides.which[:, rows]
     moving = jnp.concatenate([on[side][:, None, None] * unit for side in mine], axis=2)
     turning = jnp.concatenate([on[side][:, None, None] * jnp.roll(unit, 3, axis=2) for side in mine], axis=2)
-    kept, fading = responses(body, articulation, Momenta(turning, moving), sizes[rows], rule.fade)
+    kept, fading = responses(body, articulation, Momenta(turning, moving), sizes[rows], settings.fade)
     velocity, spin = (jnp.stack(each) for each in zip(kept, fading, strict=True))
     return mine, (velocity, spin)
 
@@ -159,15 +164,22 @@ def _looseness(sizes: Array) -> tuple[Array, Array]:
 class System:
     """The contacts of a step: all that stays the same in its substeps.
 
-    C contacts of S sides: pairs of links first, then balls on the ground. rule, dt [s]: see `integrate`.
+    C contacts of S sides: pairs of links first, then balls on the ground. settings, dt [s]: see `integrate`.
     """
 
     def __init__(
-        self, candidates: Candidates, links: Links, chosen: Array, sides: Sides, spread: Spread, dt: float, rule: Rule
+        self,
+        candidates: Candidates,
+        links: Links,
+        chosen: Array,
+        sides: Sides,
+        spread: Spread,
+        dt: float,
+        settings: ContactSettings,
     ) -> None:
         scene, balls = candidates.scene, candidates.balls
         self.pairs, self.balls, self.sides = len(chosen), len(balls), len(sides.owners)
-        self.dt, self.h, self.rule, self.dtype = dt, dt / rule.substeps, rule, chosen.dtype
+        self.dt, self.h, self.settings, self.dtype = dt, dt / settings.substeps, settings, chosen.dtype
         self.coupled, self.couplings = _couplings(scene, sides, spread)
         self.same, self.together = _same_balls(scene, sides, balls)
         self.position, self.half, self.velocity, self.spin, *rates = (sides.of(each) for each in links[:-1])
@@ -185,8 +197,8 @@ class System:
         )
         self.mass = self._mass()
         # Of what fades, so much is left after a substep, and so much there is on average of what it has gained.
-        self.left = float(np.exp(-self.h / rule.fade))
-        self.mean = rule.fade / self.h * (1.0 - self.left)
+        self.left = float(np.exp(-self.h / settings.fade))
+        self.mean = settings.fade / self.h * (1.0 - self.left)
 
     def _constants(self, name: str, chosen: Array, of_pairs: Sequence[Surface], of_balls: Sequence[Surface]) -> Array:
         """Return a constant of the contacts' surfaces, (C, 1, B)."""
@@ -213,7 +225,7 @@ class System:
         pairs = self.pairs
         return jnp.concatenate([at_sides[pairs : 2 * pairs] - at_sides[:pairs], at_sides[2 * pairs :]])
 
-    def contacts(self, moves: Moves) -> tuple[Array, Array, Array]:
+    def contacts(self, moves: SideStates) -> tuple[Array, Array, Array]:
         """Return arms (S, 3, B) [m] from sides to contact points, normals (C, 3, B), and gaps (C, 1, B) [m]."""
         pairs, radius = self.pairs, self.radius
         one, two = (
@@ -264,7 +276,7 @@ class System:
             found.append(of_links + jnp.concatenate([of_balls, jnp.zeros_like(of_balls)]))
         return found[0], found[1]
 
-    def substep(self, carry: tuple[Moves, Totals], number: Array) -> tuple[tuple[Moves, Totals], None]:
+    def substep(self, carry: tuple[SideStates, Totals], number: Array) -> tuple[tuple[SideStates, Totals], None]:
         """Return the sides, and the impulses up to there, after the next substep."""
         (moves, totals), h = carry, self.h
         arms, normal, gap = self.contacts(moves)
@@ -274,7 +286,7 @@ class System:
         spinning = h * self.turning + (self.left - 1.0) * moves.fading_turning
         now = self.relative(moves.velocity + cross(moves.spin, arms))
         uncounted = self.relative(self.uncounted + cross(self.uncounted_turning, arms))
-        problem = Problem(
+        problem = ContactProblem(
             velocity=now + self.relative(faster + cross(spinning, arms)),
             admittance=self.admittance(arms, gains),
             reference=contact.spring(self.stiffness, self.damping, now, gap, normal, h) + h * uncounted,
@@ -283,13 +295,13 @@ class System:
             friction=self.friction,
             active=jax.lax.stop_gradient((gap < 0.0).astype(self.dtype)),
         )
-        impulses = contact.impulses_of(problem, jax.lax.stop_gradient(moves.impulses), self.rule.iterations)
+        impulses = contact.impulses_of(problem, jax.lax.stop_gradient(moves.impulses), self.settings.iterations)
         on_sides = jnp.concatenate([-impulses[: self.pairs], impulses])
         torques = cross(arms, on_sides)
         gained, gained_turning = self.gained(gains, on_sides, torques)
         velocity = moves.velocity + faster + gained[0] + self.mean * gained[1]
         spin = moves.spin + spinning + gained_turning[0] + self.mean * gained_turning[1]
-        after = Moves(
+        after = SideStates(
             centre=moves.centre + h * velocity,
             half=turned(moves.half, h * spin),
             velocity=velocity,
@@ -299,7 +311,7 @@ class System:
             impulses=impulses,
         )
         # Of these impulses so much is there at the end of the step, and acts, all in all, for so long.
-        rest, fade = self.dt - (number + 1.0) * h, self.rule.fade
+        rest, fade = self.dt - (number + 1.0) * h, self.settings.fade
         fades = self.mean * jnp.exp(-rest / fade)
         there = jnp.stack([jnp.ones_like(rest), fades])
         lasts = jnp.stack([rest + h, self.mean * (h + fade) - fade * fades])
@@ -315,9 +327,9 @@ class System:
         """Return the impulses of all substeps."""
         still = jnp.zeros_like(self.position)
         none = jnp.zeros((self.pairs + self.balls, *still.shape[1:]), self.dtype)
-        begun = Moves(self.position, self.half, self.velocity, self.spin, still, still, none)
+        begun = SideStates(self.position, self.half, self.velocity, self.spin, still, still, none)
         nothing = jnp.zeros((2, *still.shape), self.dtype)
-        numbers = jnp.arange(self.rule.substeps, dtype=self.dtype)
+        numbers = jnp.arange(self.settings.substeps, dtype=self.dtype)
         (_, totals), _ = jax.lax.scan(self.substep, (begun, ((nothing, nothing), (nothing, nothing))), numbers)
         return totals
 

@@ -1,4 +1,4 @@
-"""How an articulated body responds to impulses: the velocities of all its links, and how servos take them back.
+"""Response of an articulated body to impulses: the velocities of all its links, which servos take back.
 
 What links have gained a time t after a unit impulse is w(t). Joints resist at once by their armature alone, and later
 by damping and stiffness as well. An implicit step of length T knows

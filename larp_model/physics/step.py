@@ -26,7 +26,7 @@ from larp_model.mechanics import (
     velocity_products,
 )
 from larp_model.physics.ball import ball_motion
-from larp_model.physics.collision import Candidates, Links, Rule
+from larp_model.physics.collision import Candidates, ContactSettings, Links
 from larp_model.physics.impact import integrate
 from larp_model.scene import Body, Scene
 
@@ -49,7 +49,7 @@ Correction = Callable[[Body, Array, Array, BodyMotion, float], BodyMotion]
 
 def step(
     scene: Scene, state: Array, control: Array, torque: Array, morphology: Array,
-    constants: Mapping[str, Constants], rule: Rule,
+    constants: Mapping[str, Constants], settings: ContactSettings,
     correct: Correction = lambda body, state, sizes, motion, dt: motion,
 ) -> Array:  # fmt: skip
     """Return states (B, L, 13) one `scene.dt` after states (B, L, 13).
@@ -87,15 +87,15 @@ def step(
             dt * (links.velocity + 0.5 * dt * links.acceleration), dt * (links.spin + 0.5 * dt * links.turning),
         )  # fmt: skip
         motion = BodyMotion(*(jnp.where(balls, fly, own) for fly, own in zip(flying, motion, strict=True)))
-        gained = integrate(scene, links, articulations, candidates.gaps(links, dt, rule), dt, rule)
+        gained = integrate(scene, links, articulations, candidates.gaps(links, dt, settings), dt, settings)
         both = BodyMotion(*(own + more for own, more in zip(motion, gained, strict=True)))
         return given._replace(state=_after(given.state, both)), None
 
     motion, articulations = free(given, scene.dt)
     after = _after(before, motion)
     if scene.pairs:
-        gaps = candidates.gaps(_links(scene, given, motion, articulations, scene.dt), scene.dt, rule)
-        near = jnp.min(gaps, axis=0) < rule.margin
+        gaps = candidates.gaps(_links(scene, given, motion, articulations, scene.dt), scene.dt, settings)
+        near = jnp.min(gaps, axis=0) < settings.margin
         after = _where(near, lambda given: jax.lax.scan(half, given, length=2)[0].state, given, after)
     return jnp.moveaxis(after, -1, 0)
 
