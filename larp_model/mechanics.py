@@ -305,7 +305,7 @@ def responses(body: Body, rows: np.ndarray, matrices: Array, morphology: Array, 
         for links, parents in tree(body)
     ]
     whole, _, joined = inwards(inertias(body, matrices, sizes), Momenta(still, still), levels)
-    gives = {0: inverse(Inertia(*(block[:1] for block in whole)))}
+    gives = {0: inverse(whole)}
     # A scan over levels, filled up to as many links of each, because as many copies take long to compile.
     needed = _ancestry(body, rows)
     lines = [line for level in levels if len(line := level.rows[np.isin(level.rows, needed)])]
@@ -315,7 +315,7 @@ def responses(body: Body, rows: np.ndarray, matrices: Array, morphology: Array, 
     for line, level, joint in zip(lines, levels, joined, strict=False):
         at = np.searchsorted(level.rows, line)
         above = np.array([np.flatnonzero(last == parent)[0] for parent in level.parents[at]])
-        arrays = level.child, level.child - level.parent, joint.to_turn, joint.to_move, joint.factor
+        arrays = level.child, level.child - level.parent, joint.by_parent, joint.solved
         given.append((above, *(each[at] for each in arrays)))
         last = line
     if given:
@@ -349,13 +349,14 @@ def inverse(inertia: Inertia) -> Inertia:
     return Inertia(turning, mixed, still - mm(jnp.swapaxes(lever, 1, 2), mixed))
 
 
-def _outwards(parents: Inertia, given: tuple[Array, Array, Array, Array, Array, Array]) -> tuple[Inertia, Inertia]:
+def _outwards(parents: Inertia, given: tuple[Array, Array, Array, Array, Array]) -> tuple[Inertia, Inertia]:
     """How the links of a level give way, twice over, from how those of the one before do; see `responses`.
 
-    given: which of those are their parents, `Level.child`, the way from `Level.parent` to it, and of `Joined` all but
-    the first.
+    given: which of those are their parents, `Level.child`, the way from `Level.parent` to it, `Joined.by_parent` and
+    `Joined.solved`.
     """
-    above, child, arm, to_turn, to_move, factor = given
+    above, child, arm, by_parent, solved = given
+    to_turn, to_move = by_parent[:, :, :3], by_parent[:, :, 3:]
     parent = Inertia(*(block[above] for block in parents))
     unit = jnp.broadcast_to(jnp.eye(3, dtype=child.dtype)[..., None], to_turn.shape)
     by_turn = -to_turn - cross_rows(to_move, arm)
@@ -371,7 +372,7 @@ def _outwards(parents: Inertia, given: tuple[Array, Array, Array, Array, Array, 
     def whole(first: tuple[Array, Array], second: tuple[Array, Array]) -> Array:
         return mm(first[0], jnp.swapaxes(second[0], 1, 2)) + mm(first[1], jnp.swapaxes(second[1], 1, 2))
 
-    turns = upper(factor, lower(factor, unit))
+    turns = mm(jnp.swapaxes(solved, 1, 2), solved)
     aside = -cross_rows(turns, child)
     own = Inertia(
         whole(half[0], to_spin) + turns, whole(half[0], to_velocity) + aside,
@@ -398,7 +399,7 @@ def turn(orientation: Array, rotation_vector: Array) -> Array:
     half = 0.5 * rotation_vector
     real = w - _dot(half, v)
     imaginary = v + w * half + cross(half, v)
-    scale = (real**2 + _dot(imaginary, imaginary)) ** -0.5
+    scale = jax.lax.rsqrt(real**2 + _dot(imaginary, imaginary))
     return scale * jnp.concatenate([real, imaginary], axis=1)
 
 
@@ -612,81 +613,83 @@ def ramp(value: Array, width: float) -> Array:
 
 
 class Joined(NamedTuple):
-    """Of a level's joints: what turns them, (n, 3, B), by their pushes, and (n, 3, 3, B) by their parents' motion.
+    """A level's joints: spins (n, 3, B) [rad/s] that pushes give them alone, and what their parents' motion takes off.
 
-    turned: alone [rad/s]. to_turn, to_move: less per spin and per velocity of the parent, seen from the link. factor:
-    the lower triangle L of what resists the joint's turning, L L'. half_turn, half_move: L' times to_turn, to_move.
+    solved: L^-1 (n, 3, 3, B), of the lower triangle L in L L' = S' A S + G. half (n, 3, 6, B): L^-1 S' A. by_parent
+    (n, 3, 6, B): L'^-1 of that, spin per spin and velocity that the parent gives its child's centre.
     """
 
     turned: Array
-    to_turn: Array
-    to_move: Array
-    factor: Array
-    half_turn: Array
-    half_move: Array
+    by_parent: Array
+    half: Array
+    solved: Array
 
 
 def inwards(inertia: Inertia, push: Momenta, levels: list[Level]) -> tuple[Inertia, Momenta, list[Joined]]:
-    """Inertia and push of the root with all that hangs on it, and the joints of the levels."""
-    passed = []
+    """Return inertia and push (1, ...) of the root with all that hangs on it, and the joints of the levels.
+
+    Inertia and push of a link are the columns of one matrix (n, 6, 7, B), whose every operation is one loop.
+    """
+    every = jnp.concatenate([packed_inertia(inertia), jnp.concatenate([push.turning, push.moving], 1)[:, :, None]], 2)
+    passed, handed, below = [], every[:0], np.array([], int)
     for level in reversed(levels):
-        own = Inertia(*(block[level.rows] for block in inertia))
-        moved = Momenta(*(each[level.rows] for each in push))
-        moved = Momenta(moved.turning - mv(own.mixed, level.closing), moved.moving - mv(own.moving, level.closing))
+        own = held(with_children(every[level.rows], level.rows, handed, below))
+        child, arm = level.child, level.child - level.parent
         # A S, and S' A S + G
-        across = own.turning + cross_rows(own.mixed, level.child)
-        along = jnp.swapaxes(own.mixed, 1, 2) + cross_rows(own.moving, level.child)
-        across, along, moved = held((across, along, moved))
-        factor = held(cholesky(across - cross_columns(level.child, along) + level.hold))
+        along = own[:, :, :3] + cross_rows(own[:, :, 3:6], child)
+        factor = inverse_cholesky(along[:, :3] - cross_columns(child, along[:, 3:]) + level.hold)
+        moved = own[:, :, 6] - product(own[:, :, 3:6], level.closing)
+        pull = level.pull + moved[:, :3] - cross(child, moved[:, 3:])
         # L^-1 (S' A), with which A - A S (L L')^-1 S' A stays positive in 32 bits, however light a link is held
-        half_turn, half_move = (lower(factor, jnp.swapaxes(each, 1, 2)) for each in (across, along))
-        half = lower(factor, (level.pull + moved.turning - cross(level.child, moved.moving))[:, :, None])
-        half_turn, half_move, half = held((half_turn, half_move, half))
-        to_turn, to_move = upper(factor, half_turn), upper(factor, half_move)
-        turned = upper(factor, half)[:, :, 0]
-        turned, to_turn, to_move = held((turned, to_turn, to_move))
-        passed.append(Joined(turned, to_turn, to_move, factor, half_turn, half_move))
+        half = held(mm(factor, jnp.concatenate([jnp.swapaxes(along, 1, 2), pull[:, :, None]], axis=2)))
+        relative = mm(jnp.swapaxes(factor, 1, 2), half)
+        passed.append(Joined(relative[:, :, 6], relative[:, :, :6], half[:, :, :6], factor))
         # What the joint hands on: A - A S (S' A S + G)^-1 S' A, seen from the parent's centre
-        turning, mixed, moving = (
-            own.turning - mm(jnp.swapaxes(half_turn, 1, 2), half_turn),
-            own.mixed - mm(jnp.swapaxes(half_turn, 1, 2), half_move),
-            own.moving - mm(jnp.swapaxes(half_move, 1, 2), half_move),
-        )
-        handed = Momenta(moved.turning - mv(across, turned), moved.moving - mv(along, turned))
-        turning, mixed, moving, handed = held((turning, mixed, moving, handed))
-        arm = level.child - level.parent
-        reaching = jnp.swapaxes(mixed, 1, 2) + cross_rows(moving, arm)
-        onto = Inertia(
-            turning + cross_rows(mixed, arm) - cross_columns(arm, reaching), mixed - cross_columns(arm, moving), moving
-        )
-        inertia = Inertia(*(added(a, b, level.parents) for a, b in zip(inertia, onto, strict=True)))
-        handed = Momenta(handed.turning - cross(arm, handed.moving), handed.moving)
-        push = Momenta(*(added(a, b, level.parents) for a, b in zip(push, handed, strict=True)))
-        inertia, push = held((inertia, push))
-    return inertia, push, passed[::-1]
+        kept = jnp.concatenate([own[:, :, :6], moved[:, :, None]], axis=2)
+        left = held(kept - mm(jnp.swapaxes(half[:, :, :6], 1, 2), half))
+        shifted = carried_back(arm, left)
+        seen_there = shifted[:, :, :3] + cross_rows(shifted[:, :, 3:6], arm)
+        handed, below = held(jnp.concatenate([seen_there, shifted[:, :, 3:]], axis=2)), level.parents
+    root = with_children(every[:1], np.array([0]), handed, below)
+    whole = Inertia(root[:, :3, :3], root[:, :3, 3:6], root[:, 3:, 3:6])
+    return whole, Momenta(root[:, :3, 6], root[:, 3:, 6]), passed[::-1]
+
+
+def packed_inertia(inertia: Inertia) -> Array:
+    """Return inertias (n, 6, 6, B) by their blocks."""
+    mixed = jnp.swapaxes(inertia.mixed, 1, 2)
+    upper_rows = jnp.concatenate([inertia.turning, inertia.mixed], axis=2)
+    return jnp.concatenate([upper_rows, jnp.concatenate([mixed, inertia.moving], axis=2)], axis=1)
+
+
+def with_children(own: Array, rows: np.ndarray, handed: Array, parents: np.ndarray) -> Array:
+    """Return links (n, ...) in these rows of a body with what their children (m, ...), of these parents, hand on."""
+    children = [np.flatnonzero(parents == row) for row in rows]
+    handed = jnp.concatenate([handed, jnp.zeros_like(own[:1])])
+    for number in range(max(map(len, children), default=0)):
+        chosen = [each[number] if number < len(each) else len(parents) for each in children]
+        own = own + handed[np.array(chosen)]
+    return own
+
+
+def carried_back(arm: Array, wrench: Array) -> Array:
+    """Return moments and forces (n, 6, k, B) about the point that is `arm` (n, 3, B) away from the given ones'."""
+    return jnp.concatenate([wrench[:, :3] - cross_columns(arm, wrench[:, 3:]), wrench[:, 3:]], axis=1)
 
 
 def solve(inertia: Inertia, push: Momenta, levels: list[Level]) -> tuple[Array, Array]:
     """Velocities and spins (n, 3, B) with which links part under their pushes and their joints' impulses."""
-    inertia, push, passed = inwards(inertia, push, levels)
-    spin, velocity = _root(Inertia(*(block[:1] for block in inertia)), Momenta(*(each[:1] for each in push)))
-    rows = np.array([0])
-    for level, (turned, to_turn, to_move, *_) in zip(levels, passed, strict=True):
-        above = np.array([int(np.flatnonzero(rows == parent)[0]) for parent in level.parents])
-        turning, moving = spin[above], velocity[above]
-        arm = level.child - level.parent
-        carried = moving + cross(arm, turning)
-        relative = turned - mv(to_turn, turning) - mv(to_move, carried)
-        rows = np.concatenate([rows, level.rows])
-        spin = jnp.concatenate([spin, turning + relative])
-        velocity = jnp.concatenate([velocity, carried + cross(level.child, relative) + level.closing])
-    order = np.argsort(rows)
-    return velocity[order], spin[order]
-
-
-def added(whole: Array, parts: Array, rows: np.ndarray) -> Array:
-    """The whole (n, ...) with parts added to its rows, in which one may come more than once."""
-    return jnp.stack([sum((parts[i] for i in np.flatnonzero(rows == row)), whole[row]) for row in range(len(whole))])
+    inertia, push, joints = inwards(inertia, push, levels)
+    motions, order = [jnp.concatenate(_root(inertia, push), axis=1)], [np.array([0])]
+    for level, joint in zip(levels, joints, strict=True):
+        above = motions[-1][np.searchsorted(order[-1], level.parents)]
+        carried = above[:, 3:] + cross(level.child - level.parent, above[:, :3])
+        relative = joint.turned - product(joint.by_parent, jnp.concatenate([above[:, :3], carried], axis=1))
+        velocity = carried + cross(level.child, relative) + level.closing
+        motions.append(held(jnp.concatenate([above[:, :3] + relative, velocity], axis=1)))
+        order.append(level.rows)
+    motion = jnp.concatenate(motions)[np.argsort(np.concatenate(order))]
+    return motion[:, 3:], motion[:, :3]
 
 
 def _root(inertia: Inertia, push: Momenta) -> tuple[Array, Array]:
@@ -709,8 +712,14 @@ def mv(matrix: Array, vector: Array) -> Array:
     return a + b + c
 
 
+def product(matrix: Array, vector: Array) -> Array:
+    """Matrices (n, m, k, B) times vectors (n, k, B)."""
+    columns = [matrix[:, :, k] * vector[:, None, k] for k in range(matrix.shape[2])]
+    return sum(columns[1:], columns[0])
+
+
 def mm(first: Array, second: Array) -> Array:
-    """Products of matrices (n, 3, 3, B)."""
+    """Products of matrices (n, k, 3, B) and (n, 3, m, B)."""
     a, b, c = (first[:, :, k, None] * second[:, None, k] for k in range(3))
     return a + b + c
 
@@ -735,32 +744,16 @@ def _cross(first: Array, second: Array, axis: int) -> Array:
     return jnp.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=axis)
 
 
-def cholesky(matrix: Array) -> Array:
-    """Lower triangles L (n, 3, 3, B) of positive definite matrices L L'."""
-    a = jnp.sqrt(matrix[:, 0, 0])
-    b, c = matrix[:, 1, 0] / a, matrix[:, 2, 0] / a
-    d = jnp.sqrt(matrix[:, 1, 1] - b * b)
-    e = (matrix[:, 2, 1] - c * b) / d
-    f = jnp.sqrt(matrix[:, 2, 2] - c * c - e * e)
+def inverse_cholesky(matrix: Array) -> Array:
+    """Return L^-1 (n, 3, 3, B) of positive definite matrices L L' and lower triangles L."""
+    a = jax.lax.rsqrt(matrix[:, 0, 0])
+    b, c = matrix[:, 1, 0] * a, matrix[:, 2, 0] * a
+    d = jax.lax.rsqrt(matrix[:, 1, 1] - b * b)
+    e = (matrix[:, 2, 1] - c * b) * d
+    f = jax.lax.rsqrt(matrix[:, 2, 2] - c * c - e * e)
     none = jnp.zeros_like(a)
-    rows = ((a, none, none), (b, d, none), (c, e, f))
-    return jnp.stack([jnp.stack(row, axis=1) for row in rows], axis=1)
-
-
-def lower(factor: Array, right: Array) -> Array:
-    """L^-1 of columns (n, 3, k, B)."""
-    x = right[:, 0] / factor[:, 0, 0, None]
-    y = (right[:, 1] - factor[:, 1, 0, None] * x) / factor[:, 1, 1, None]
-    z = (right[:, 2] - factor[:, 2, 0, None] * x - factor[:, 2, 1, None] * y) / factor[:, 2, 2, None]
-    return jnp.stack([x, y, z], axis=1)
-
-
-def upper(factor: Array, right: Array) -> Array:
-    """L'^-1 of columns (n, 3, k, B)."""
-    z = right[:, 2] / factor[:, 2, 2, None]
-    y = (right[:, 1] - factor[:, 2, 1, None] * z) / factor[:, 1, 1, None]
-    x = (right[:, 0] - factor[:, 1, 0, None] * y - factor[:, 2, 0, None] * z) / factor[:, 0, 0, None]
-    return jnp.stack([x, y, z], axis=1)
+    rows = ((a, none, none), (-b * a * d, d, none), ((e * b * d - c) * a * f, -e * d * f, f))
+    return held(jnp.stack([jnp.stack(row, axis=1) for row in rows], axis=1))
 
 
 def invert(matrix: Array) -> Array:

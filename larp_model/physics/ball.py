@@ -5,6 +5,8 @@ Arrays have the batch last, as in `mechanics`: vectors (1, 3, B).
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -49,24 +51,27 @@ def ball_motion(body: Body, state: Array, outside: Array, sizes: Array, gravity:
         return (x + h * vx, y + h * vy, z + h * vz, vx, vy, vz, wx, wy, wz), None
 
     position, velocity, spin = (
-        state[0, columns] for columns in (packed.POSITION, packed.VELOCITY, packed.ANGULAR_VELOCITY)
+        state[:, columns] for columns in (packed.POSITION, packed.VELOCITY, packed.ANGULAR_VELOCITY)
     )
-    begun = (*position, *velocity, *spin)
 
-    def flying() -> tuple[Array, ...]:
-        # As so many substeps would have it.
-        fallen = dt * velocity[2] - 0.5 * dt * (dt + h) * gravity
-        turned = spin + dt * turns * outside[0]
-        return (
-            position[0] + dt * velocity[0], position[1] + dt * velocity[1], position[2] + fallen,
-            velocity[0], velocity[1], velocity[2] - dt * gravity, *turned,
-        )  # fmt: skip
+    def on_the_ground() -> BodyMotion:
+        after, _ = jax.lax.scan(substep, (*position[0], *velocity[0], *spin[0]), length=SUBSTEPS)
+        place, moving, turning = (jnp.stack(after[begin : begin + 3])[None] for begin in (0, 3, 6))
+        return BodyMotion(moving, turning, place - position, 0.5 * dt * (spin + turning))
 
-    def on_the_ground() -> tuple[Array, ...]:
-        return jax.lax.scan(substep, begun, length=SUBSTEPS)[0]
+    lowest = position[0, 2] - radius + jnp.minimum(dt * velocity[0, 2] - dt**2 * gravity, 0.0)
+    return jax.lax.cond(
+        jnp.any(lowest < 0.0), on_the_ground, lambda: flight(body, state, outside, sizes, gravity, dt, SUBSTEPS)
+    )
 
-    lowest = position[2] - radius + jnp.minimum(dt * velocity[2] - dt**2 * gravity, 0.0)
-    after = jax.lax.cond(jnp.any(lowest < 0.0), on_the_ground, flying)
-    place, moving, turning = (jnp.stack(after[begin : begin + 3]) for begin in (0, 3, 6))
-    motion = moving, turning, place - position, 0.5 * dt * (spin + turning)
-    return BodyMotion(*(each[None] for each in motion))
+
+def flight(
+    body: Body, state: Array, outside: Array, sizes: Array, gravity: float, dt: float, substeps: float = math.inf
+) -> BodyMotion:
+    """Return `ball_motion` of a ball that nothing touches, as so many substeps have it."""
+    velocity, spin = state[:, packed.VELOCITY], state[:, packed.ANGULAR_VELOCITY]
+    falling = jnp.array([0.0, 0.0, -gravity], state.dtype)[:, None]
+    turns = 1.0 / moments(*(sizes[:, column : column + 1] for column in range(3)))[0]
+    turning = spin + dt * turns * outside
+    fallen = dt * velocity + 0.5 * dt * (dt + dt / substeps) * falling
+    return BodyMotion(velocity + dt * falling, turning, fallen, 0.5 * dt * (spin + turning))

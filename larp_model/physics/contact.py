@@ -34,6 +34,19 @@ from larp_model.mechanics import held, invert, mm, mv
 SHARES = (0.015625, 0.0625, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0)
 
 
+# Of a scene's largest impulse, so much may its contacts be off, in units of the precision: 1e-4 in 32 bits.
+TOLERANCE = 1000.0
+
+
+class NewtonState(NamedTuple):
+    """Impulses and velocities u' (C, 3, B); what those call for, see `ContactProblem.wanted`."""
+
+    impulses: Array
+    velocity: Array
+    point: Array
+    mass: Array
+
+
 class ContactProblem(NamedTuple):
     """C contacts: the module's u_free (C, 3, B) [m/s], A (C, C, 3, 3, B) [1/kg], u_ref (C, 3, B) [m/s] and m (C, 1, B).
 
@@ -67,21 +80,36 @@ class ContactProblem(NamedTuple):
 
 @partial(jax.custom_jvp, nondiff_argnums=(2,))
 def impulses_of(problem: ContactProblem, guess: Array, iterations: int) -> Array:
-    """Return the impulses J (C, 3, B) [N s] of all contacts by so many Newton iterations; see the module."""
+    """Return the impulses J (C, 3, B) [N s] of all contacts; see the module.
 
-    def newton(found: tuple[Array, Array], nothing: None) -> tuple[tuple[Array, Array], None]:
-        impulses, velocity = found
-        point, mass = problem.wanted(velocity)
+    iterations: of Newton's method, at most; a scene ends where its residual is below `TOLERANCE`, whatever others do.
+    """
+
+    def unsettled(state: NewtonState) -> Array:
+        residual, largest = (
+            jnp.max(jnp.abs(each), axis=(0, 1)) for each in (state.point - state.impulses, state.impulses)
+        )
+        return residual > TOLERANCE * jnp.finfo(largest.dtype).eps * largest
+
+    def at(impulses: Array, velocity: Array) -> NewtonState:
+        return NewtonState(impulses, velocity, *problem.wanted(velocity))
+
+    def newton(carry: tuple[Array, NewtonState]) -> tuple[Array, NewtonState]:
+        number, state = carry
+        impulses, velocity, point, mass = state
         # Linear around the velocities, J = q - M u'.
         push = point + mv(mass, velocity)
         new_velocity = solved(_matrix(problem.admittance, mass), problem.after(push))
         new = push - mv(mass, new_velocity)
-        share = _line_search(problem, (velocity, new_velocity), (impulses, new))
-        return (impulses + share * (new - impulses), velocity + share * (new_velocity - velocity)), None
+        share = jnp.where(unsettled(state), _line_search(problem, (velocity, new_velocity), (impulses, new)), 0.0)
+        return number + 1, at(impulses + share * (new - impulses), velocity + share * (new_velocity - velocity))
+
+    def goes_on(carry: tuple[Array, NewtonState]) -> Array:
+        return (carry[0] < iterations) & jnp.any(unsettled(carry[1]))
 
     begun = _one_by_one(problem, guess * problem.active)
-    (impulses, _), _ = jax.lax.scan(newton, (begun, problem.after(begun)), length=iterations)
-    return impulses
+    _, found = jax.lax.while_loop(goes_on, newton, (jnp.array(0), at(begun, problem.after(begun))))
+    return found.impulses
 
 
 @impulses_of.defjvp

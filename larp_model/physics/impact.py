@@ -98,8 +98,8 @@ def integrate(
             found = []
             for forces, torques in totals:
                 wrench = jnp.stack([jnp.concatenate([forces[:, side], torques[:, side]], axis=1) for side in mine], 1)
-                wrench = wrench.reshape(2, 1, 1, -1, wrench.shape[-1])
-                found += [jnp.sum(each * wrench, axis=(0, 3)) for each in (velocity, spin)]
+                wrench = wrench.reshape(2, -1, wrench.shape[-1])
+                found += [_summed(each, wrench) for each in (velocity, spin)]
             parts.append(Gained(*found))
         else:
             parts.append(Gained(*[jnp.zeros_like(links.position[rows])] * 4))
@@ -338,6 +338,13 @@ def _onto(parts: Array, rows: np.ndarray, count: int) -> Array:
     """Return (m, count, ..., B) with parts (m, n, ..., B) added up in these rows."""
     nothing = jnp.zeros((parts.shape[0], *parts.shape[2:]), parts.dtype)
     return jnp.stack([sum((parts[:, i] for i in np.flatnonzero(rows == row)), nothing) for row in range(count)], axis=1)
+
+
+def _summed(gains: Array, wrench: Array) -> Array:
+    """Return (n, 3, B) gains (2, n, 3, k, B) times wrenches (2, k, B), kept and fading together."""
+    # A sum of slices: XLA hands a reduction to a library that takes ten times as long to begin.
+    each = [gains[part, :, :, k] * wrench[part, k] for part in range(2) for k in range(wrench.shape[1])]
+    return sum(each[1:], each[0])
 
 
 def _mv(matrix: Array, vector: Array) -> Array:

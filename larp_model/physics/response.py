@@ -27,15 +27,15 @@ from larp_model.mechanics import (
     Joined,
     Level,
     Momenta,
-    added,
+    carried_back,
     cross_columns,
     held,
     inverse,
     inwards,
-    lower,
     mm,
+    packed_inertia,
     tree,
-    upper,
+    with_children,
 )
 from larp_model.scene import Body
 
@@ -69,8 +69,7 @@ def responses(
         for rows, above in tree(body)
     ]
     whole, _, joints = inwards(doubled.inertia, Momenta(still, still), levels)
-    root = inverse(Inertia(*(block[:1] for block in whole)))
-    gained = _gained(body, doubled.tied, joints, root, _twice(pushes))
+    gained = _gained(body, doubled.tied, joints, inverse(whole), _twice(pushes))
     now, later = (Gains(*each) for each in zip(*(jnp.split(each, 2, axis=-1) for each in gained), strict=True))
     # W(0) = kept + fading, W(T) = kept + fading / 2
     kept = Gains(*(2.0 * b - a for a, b in zip(now, later, strict=True)))
@@ -92,29 +91,33 @@ def _resistance(body: Body, sizes: Array, after: float) -> Array:
 
 def _gained(body: Body, tied: Anchors, joints: list[Joined], root: Inertia, pushes: Momenta) -> Gains:
     """Return what links gain by pushes, the inertias of the tree being known: see `mechanics.inwards`."""
-    levels, alone = tree(body), []
+    levels, halves = tree(body), []
+    every = jnp.concatenate([pushes.turning, pushes.moving], axis=1)
+    handed, below = every[:0], np.array([], int)
     for (rows, above), joint in zip(reversed(levels), reversed(joints), strict=True):
-        own = Momenta(*(each[rows] for each in pushes))
+        own = held(with_children(every[rows], rows, handed, below))
         child, arm = tied.child[rows - 1], tied.child[rows - 1] - tied.parent[rows - 1]
-        half = lower(joint.factor, own.turning - cross_columns(child, own.moving))
-        alone.append(upper(joint.factor, half))
-        moving = own.moving - mm(jnp.swapaxes(joint.half_move, 1, 2), half)
-        turning = own.turning - mm(jnp.swapaxes(joint.half_turn, 1, 2), half) - cross_columns(arm, moving)
-        pushes = held(Momenta(*(added(a, b, above) for a, b in zip(pushes, Momenta(turning, moving), strict=True))))
-    at_root = Momenta(*(each[:1] for each in pushes))
-    spin = mm(root.turning, at_root.turning) + mm(root.mixed, at_root.moving)
-    velocity = mm(jnp.swapaxes(root.mixed, 1, 2), at_root.turning) + mm(root.moving, at_root.moving)
-    known = np.array([0])
-    for (rows, above), joint, turned in zip(levels, joints, reversed(alone), strict=True):
-        at = np.array([int(np.flatnonzero(known == row)[0]) for row in above])
+        half = held(mm(joint.solved, own[:, :3] - cross_columns(child, own[:, 3:])))
+        halves.append(half)
+        handed, below = held(carried_back(arm, own - mm(jnp.swapaxes(joint.half, 1, 2), half))), above
+    at_root = with_children(every[:1], np.array([0]), handed, below)
+    motions, order = [_six(packed_inertia(root), at_root)], [np.array([0])]
+    for (rows, above), joint, half in zip(levels, joints, reversed(halves), strict=True):
+        parent = motions[-1][np.searchsorted(order[-1], above)]
         child, arm = tied.child[rows - 1], tied.child[rows - 1] - tied.parent[rows - 1]
-        carried = velocity[at] + cross_columns(arm, spin[at])
-        relative = turned - mm(joint.to_turn, spin[at]) - mm(joint.to_move, carried)
-        known = np.concatenate([known, rows])
-        velocity = jnp.concatenate([velocity, carried + cross_columns(child, relative)])
-        spin = jnp.concatenate([spin, spin[at] + relative])
-    order = np.argsort(known)
-    return Gains(velocity[order], spin[order])
+        carried = parent[:, 3:] + cross_columns(arm, parent[:, :3])
+        given = jnp.concatenate([parent[:, :3], carried], axis=1)
+        relative = held(mm(jnp.swapaxes(joint.solved, 1, 2), half) - _six(joint.by_parent, given))
+        velocity = carried + cross_columns(child, relative)
+        motions.append(held(jnp.concatenate([parent[:, :3] + relative, velocity], axis=1)))
+        order.append(rows)
+    motion = jnp.concatenate(motions)[np.argsort(np.concatenate(order))]
+    return Gains(motion[:, 3:], motion[:, :3])
+
+
+def _six(first: Array, second: Array) -> Array:
+    """Return products of matrices (n, k, 6, B) and (n, 6, m, B)."""
+    return mm(first[:, :, :3], second[:, :3]) + mm(first[:, :, 3:], second[:, 3:])
 
 
 def _twice(arrays: Arrays) -> Arrays:

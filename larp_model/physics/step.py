@@ -14,7 +14,6 @@ import numpy as np
 from jax import Array
 
 from larp_model import state as packed
-from larp_model.compliance import moments
 from larp_model.mechanics import (
     Articulation,
     BodyMotion,
@@ -25,7 +24,7 @@ from larp_model.mechanics import (
     turns,
     velocity_products,
 )
-from larp_model.physics.ball import ball_motion
+from larp_model.physics.ball import ball_motion, flight
 from larp_model.physics.collision import Candidates, ContactSettings, Links
 from larp_model.physics.impact import integrate
 from larp_model.scene import Body, Scene
@@ -42,6 +41,9 @@ class Given(NamedTuple):
     torques: Array
     sizes: Array
 
+
+BallMotion = Callable[[Body, Array, Array, Array, float, float], BodyMotion]
+"""(body, states (1, 13, B), torques (1, 3, B), sizes (1, 3, B), gravity, dt [s]) -> motion (1, 3, B) each."""
 
 Correction = Callable[[Body, Array, Array, BodyMotion, float], BodyMotion]
 """(body, states (n, 13, B), sizes (n, 3, B), motion (n, 3, B) each, dt [s]) -> motion, as a network knows better."""
@@ -61,13 +63,13 @@ def step(
     sizes = jnp.broadcast_to(jnp.moveaxis(morphology, 0, -1), (len(scene.links), 3, state.shape[0]))
     given, candidates = Given(before, targets, torques, sizes), Candidates(scene)
 
-    def free(given: Given, dt: float) -> tuple[BodyMotion, dict[str, Articulation]]:
+    def free(given: Given, dt: float, of_ball: BallMotion) -> tuple[BodyMotion, dict[str, Articulation]]:
         motions, articulations = [], {}
         for body in scene.bodies:
             rows = scene.rows(body.name)
             state, torques, sizes = given.state[rows], given.torques[rows], given.sizes[rows]
             if body.is_ball:
-                motion = ball_motion(body, state, torques, sizes, scene.gravity, dt)
+                motion = of_ball(body, state, torques, sizes, scene.gravity, dt)
             else:
                 aims = given.targets[scene.motor_rows(body.name)]
                 motion, articulations[body.name] = articulated_motion(
@@ -78,20 +80,14 @@ def step(
 
     def half(given: Given, nothing: None) -> tuple[Given, None]:
         dt = 0.5 * scene.dt
-        motion, articulations = free(given, dt)
-        links = _links(scene, given, motion, articulations, dt)
         # Balls are integrated with all that touches them, the ground as well.
-        balls = jnp.concatenate([jnp.full(len(body.links), body.is_ball) for body in scene.bodies])[:, None, None]
-        flying = BodyMotion(
-            links.velocity + dt * links.acceleration, links.spin + dt * links.turning,
-            dt * (links.velocity + 0.5 * dt * links.acceleration), dt * (links.spin + 0.5 * dt * links.turning),
-        )  # fmt: skip
-        motion = BodyMotion(*(jnp.where(balls, fly, own) for fly, own in zip(flying, motion, strict=True)))
+        motion, articulations = free(given, dt, flight)
+        links = _links(scene, given, motion, articulations, dt)
         gained = integrate(scene, links, articulations, candidates.gaps(links, dt, settings), dt, settings)
         both = BodyMotion(*(own + more for own, more in zip(motion, gained, strict=True)))
         return given._replace(state=_after(given.state, both)), None
 
-    motion, articulations = free(given, scene.dt)
+    motion, articulations = free(given, scene.dt, ball_motion)
     after = _after(before, motion)
     if scene.pairs:
         gaps = candidates.gaps(_links(scene, given, motion, articulations, scene.dt), scene.dt, settings)
@@ -120,7 +116,7 @@ def _where(near: Array, finely: Callable[[Given], Array], given: Given, otherwis
 
 
 def _links(scene: Scene, given: Given, motion: BodyMotion, articulations: dict[str, Articulation], dt: float) -> Links:
-    """Return all links of a scene whose bodies move so within `dt` [s]; balls as if in the air."""
+    """Return all links of a scene whose bodies move so within `dt` [s]."""
     position, orientation, velocity, spin = (
         given.state[:, columns]
         for columns in (packed.POSITION, packed.ORIENTATION, packed.VELOCITY, packed.ANGULAR_VELOCITY)
@@ -129,14 +125,8 @@ def _links(scene: Scene, given: Given, motion: BodyMotion, articulations: dict[s
     half = 0.5 * given.sizes[:, :1] * mv(turns(orientation), axes)
     acceleration, turning = (motion.velocity - velocity) / dt, (motion.spin - spin) / dt
     uncounted, uncounted_turning = [], []
-    down = jnp.array([0.0, 0.0, -scene.gravity], given.state.dtype)[None, :, None]
     for body in scene.bodies:
         rows = scene.rows(body.name)
-        if body.is_ball:
-            sizes = given.sizes[rows]
-            inertia = moments(sizes[:, 0], sizes[:, 1], sizes[:, 2])[0][:, None]
-            acceleration = acceleration.at[rows].set(jnp.broadcast_to(down, acceleration[rows].shape))
-            turning = turning.at[rows].set(given.torques[rows] / inertia)
         if body.joints:
             linear, angular = velocity_products(body, articulations[body.name].tied, spin[rows])
         else:
