@@ -100,6 +100,11 @@ class Simulator:
 
     differentiable = True
 
+    @property
+    def side_by_side(self) -> int:
+        """How many rollouts at a time take least, each, on a CPU: 32 by physics, which is made of many small loops."""
+        return 32 if isinstance(self.model.bodies[0], ResidualBody | FreeBall) else 8
+
     @staticmethod
     def load(weights: str | Path, scene: Scene | None = None) -> Simulator:
         """The simulator of weights by their manifest, or of shipped ones by their name ("human_ball", "chains2", ...).

@@ -9,9 +9,15 @@ import numpy as np
 
 from larp_model.errors import InputError
 
+# Rollouts at a time where dynamics do not say how many.
+SIDE_BY_SIDE = 8
+
 
 class Dynamics(Protocol):
-    """A model of the scene; the learned simulator and the truth simulator both are one."""
+    """A model of the scene; the learned simulator and the truth simulator both are one.
+
+    It may say in an attribute `side_by_side` (an integer) how many rollouts at a time take least, each, on a CPU.
+    """
 
     @property
     def differentiable(self) -> bool:
@@ -23,6 +29,11 @@ class Dynamics(Protocol):
         Pure, traceable by JAX, and every row independent of the others. A row that diverged holds NaN. steps (): only
         so many of the H are wanted; the rest of them repeat the last. A planner that wants all does not pass it.
         """
+
+
+def side_by_side(dynamics: Dynamics) -> int:
+    """Return how many candidates are rolled out at a time where they are few."""
+    return int(getattr(dynamics, "side_by_side", SIDE_BY_SIDE))
 
 
 class BatchedTruth(Protocol):
@@ -87,6 +98,11 @@ class Continued:
     def differentiable(self) -> bool:
         """True where both models are differentiable."""
         return self.dynamics.differentiable and self.tail.differentiable
+
+    @property
+    def side_by_side(self) -> int:
+        """As the whole scene's dynamics say."""
+        return side_by_side(self.dynamics)
 
     def rollout(self, state: jax.Array, controls: jax.Array, *, steps: jax.Array | None = None) -> jax.Array:
         """See `Dynamics.rollout`; H' = H + `self.steps`."""

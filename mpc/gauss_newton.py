@@ -76,11 +76,15 @@ class GaussNewton:
 
     def refine(self, knots: np.ndarray, search: Search, random: np.random.Generator, problem: Problem) -> Search:
         """All rounds from knots (K, J, 3) on; every step that was tried may become an elite."""
-        here, damping = problem.tries(knots[None]), self.damping
-        search = merged(search, knots[None], here.costs)
+        here, damping = None, self.damping
         for _ in range(self.rounds):
             noise = coloured_noise(random, (self.directions, *knots.shape), self.exponent)
-            directions = search.spread * noise
+            directions, there = search.spread * noise, None
+            if here is None:  # the start and its neighbours are rolled out side by side
+                together = np.concatenate([knots[None], self.neighbours(knots, directions)])
+                tried = problem.tries(together)
+                search = merged(search, together, tried.costs)
+                here, there = tried.row(0), tried.rows(slice(1, None))
             if not np.isfinite(here.costs[0]):  # no slope where nothing comes back: look around
                 tried = problem.tries(knots + directions)
                 search = merged(search, knots + directions, tried.costs)
@@ -88,7 +92,7 @@ class GaussNewton:
                 if np.isfinite(tried.costs[best]):
                     knots, here = knots + directions[best], tried.row(best)
                 continue
-            search, derivatives = self.derivatives(knots, here, directions, search, problem)
+            search, derivatives = self.derivatives(knots, here, directions, search, problem, there)
             slopes = quadratic(here, derivatives)
             steps, coordinates, dampings = self.steps(slopes, damping, directions, search.scale)
             if not len(steps):
@@ -111,20 +115,31 @@ class GaussNewton:
             here = tried.row(best)
         return search
 
-    def derivatives(
-        self, knots: np.ndarray, here: Tried, directions: np.ndarray, search: Search, problem: Problem
-    ) -> tuple[Search, Residuals]:
-        """Of the residuals along the directions, (D, ...) by term; zero along those where they are not finite.
+    def neighbours(self, knots: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Return the knots (D, K, J, 3) that differences are taken to, none (0, K, J, 3) where they are not taken."""
+        return knots + self.step * (directions if self.jacobian == "differences" else directions[:0])
 
-        What differences try may become an elite.
+    def derivatives(
+        self,
+        knots: np.ndarray,
+        here: Tried,
+        directions: np.ndarray,
+        search: Search,
+        problem: Problem,
+        there: Tried | None = None,
+    ) -> tuple[Search, Residuals]:
+        """Return those of the residuals along the directions, (D, ...) by term; zero where they are not finite.
+
+        there: what the neighbours came to, if they are tried already. They may become elites.
         """
         usable = np.ones(len(directions), bool)
         if self.jacobian == "forward":
             found = problem.tangents(knots, directions)
         else:
-            beside = knots + self.step * directions
-            there = problem.tries(beside)
-            search = merged(search, beside, there.costs)
+            if there is None:
+                neighbours = self.neighbours(knots, directions)
+                there = problem.tries(neighbours)
+                search = merged(search, neighbours, there.costs)
             found = {name: (each - here.residuals[name]) / self.step for name, each in there.residuals.items()}
             usable = np.isfinite(there.costs)  # the residuals of what is lost may be anything
         usable &= np.all([np.isfinite(_flat(each)).all(axis=1) for each in found.values()], axis=0)

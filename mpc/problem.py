@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from mpc.cost import CostTerm, curvatures, evaluate, residuals, weighed
-from mpc.dynamics import Dynamics
+from mpc.dynamics import Dynamics, side_by_side
 from mpc.search import Residuals, Tried
 from mpc.spline import Interpolation, interpolate
 
-# Every size is compiled apart, a kick's for 8 s. So candidates are rolled out so many at a time, where there are few of
-# them: on a CPU one of 8 costs 1.1 ms, one of 24 1.0 ms.
-SIDE_BY_SIDE, FEW = 8, 32
+# Every size is compiled apart, a kick's for 8 s and more. So on a CPU candidates are rolled out
+# `side_by_side(dynamics)` at a time where there are so few of them.
+FEW = 32
 
 
 class Wanted(NamedTuple):
@@ -141,8 +141,10 @@ class PlannerProblem:
 
     def tries(self, knots: np.ndarray) -> Tried:
         """See `search.Problem`."""
-        few = len(knots) <= (FEW if jax.default_backend() == "cpu" else SIDE_BY_SIDE)
-        return self._tries(self.equations.dynamics, knots, SIDE_BY_SIDE if few else len(knots))
+        dynamics = self.equations.dynamics
+        size = side_by_side(dynamics)
+        few = len(knots) <= (max(FEW, size) if jax.default_backend() == "cpu" else size)
+        return self._tries(dynamics, knots, size if few else len(knots))
 
     def gradients(self, knots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """See `search.Problem`."""
@@ -178,7 +180,8 @@ class PlannerProblem:
 
     def shown(self, knots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Costs (N,) and states (N, H', L, 13) of knots (N, K, J, 3), for looking: they are not recorded."""
-        tried, states = self._rolled(self.equations.dynamics, knots, SIDE_BY_SIDE)
+        dynamics = self.equations.dynamics
+        tried, states = self._rolled(dynamics, knots, side_by_side(dynamics))
         return np.asarray(tried[0]), np.asarray(states)
 
     def judged(self, knots: np.ndarray) -> tuple[float, dict[str, float]]:

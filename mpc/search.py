@@ -42,12 +42,14 @@ class Tried(NamedTuple):
     residuals: Residuals
     curvatures: Residuals  # c of each residual r: near the candidate its cost is a constant + sum(c r^2) / 2
 
+    def rows(self, which: slice) -> Tried:
+        """Some of the candidates."""
+        residuals, curvatures = ({name: each[which] for name, each in values.items()} for values in self[1:])
+        return Tried(self.costs[which], residuals, curvatures)
+
     def row(self, index: int) -> Tried:
         """One of the candidates alone, N = 1."""
-        residuals, curvatures = (
-            {name: each[index : index + 1] for name, each in values.items()} for values in self[1:]
-        )
-        return Tried(self.costs[index : index + 1], residuals, curvatures)
+        return self.rows(slice(index, index + 1))
 
 
 class Problem(Protocol):
