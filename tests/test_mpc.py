@@ -524,6 +524,35 @@ def test_one_step_of_gauss_newton_solves_what_is_linear(jacobian: str) -> None:
     assert np.abs(plan.knots).max() < 1.0
 
 
+def test_a_round_of_differences_asks_for_two_rollouts() -> None:
+    class Bowl(Ripples):
+        def tries(self, knots: np.ndarray) -> Tried:
+            found, flat = super().tries(knots), knots.reshape(len(knots), -1)
+            return found._replace(residuals={"miss": flat - 0.3}, curvatures={"miss": np.ones_like(flat)})
+
+    problem, search = Bowl(), _search()
+    start = search.elites[0]
+    better = GaussNewton(rounds=1).refine(start, search, np.random.default_rng(0), problem)  # type: ignore[arg-type]
+    assert problem.counted == 2 and better.costs[0] < problem.cost(start[None])[0]
+
+
+def test_few_candidates_are_rolled_out_as_many_at_a_time_as_the_dynamics_say() -> None:
+    sizes = set()
+
+    @dataclass(frozen=True)
+    class Wide(PointMass):
+        side_by_side: int = 12
+
+        def rollout(self, state: jax.Array, controls: jax.Array, steps: jax.Array | None = None) -> jax.Array:
+            sizes.add(len(controls))
+            return super().rollout(state, controls, steps)
+
+    for dynamics in (Wide(), Continued(Wide(), Drift(), slice(0, 1), 2)):
+        planner = _planner(dynamics, CEM(samples=15, rounds=1, elites=3))
+        planner.step(planner.init(jax.random.key(0)), STATE, REFERENCE, TARGET)
+    assert sizes == {12}
+
+
 def test_forward_derivatives_and_small_differences_give_the_same_step() -> None:
     plans = [_line(rounds=1, directions=12, jacobian=jacobian)[1] for jacobian in ("forward", "differences")]
     np.testing.assert_allclose(plans[0].knots, plans[1].knots, rtol=1e-3, atol=1e-4)
