@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import _thread
 import errno
 import io
 import json as text
 import logging
 import os
+import signal
 import sys
 import threading
 import time
@@ -72,7 +72,10 @@ def _interruptible() -> Iterator[None]:
 
     def hook(dropped: sys.UnraisableHookArgs) -> None:
         if issubclass(dropped.exc_type, KeyboardInterrupt):
-            threading.Timer(0.01, _thread.interrupt_main).start()
+            # A signal of its own: `_thread.interrupt_main` of another thread wakes up nobody, and is seen by chance.
+            main_thread = threading.main_thread().ident
+            assert main_thread is not None
+            threading.Timer(0.01, signal.pthread_kill, (main_thread, signal.SIGINT)).start()
         else:
             before(dropped)
 
