@@ -102,7 +102,7 @@ class Simulator:
 
     @property
     def side_by_side(self) -> int:
-        """How many rollouts at a time take least, each, on a CPU: 32 by physics, which is made of many small loops."""
+        """Return how many rollouts are cheapest side by side on a CPU: physics is made of many small loops."""
         return 32 if isinstance(self.model.bodies[0], ResidualBody | FreeBall) else 8
 
     @staticmethod
