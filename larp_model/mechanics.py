@@ -638,7 +638,7 @@ def inwards(inertia: Inertia, push: Momenta, levels: list[Level]) -> tuple[Inert
         # A S, and S' A S + G
         along = own[:, :, :3] + cross_rows(own[:, :, 3:6], child)
         factor = inverse_cholesky(along[:, :3] - cross_columns(child, along[:, 3:]) + level.hold)
-        moved = own[:, :, 6] - product(own[:, :, 3:6], level.closing)
+        moved = own[:, :, 6] - mv(own[:, :, 3:6], level.closing)
         pull = level.pull + moved[:, :3] - cross(child, moved[:, 3:])
         # L^-1 (S' A), with which A - A S (L L')^-1 S' A stays positive in 32 bits, however light a link is held
         half = held(mm(factor, jnp.concatenate([jnp.swapaxes(along, 1, 2), pull[:, :, None]], axis=2)))
@@ -684,7 +684,7 @@ def solve(inertia: Inertia, push: Momenta, levels: list[Level]) -> tuple[Array, 
     for level, joint in zip(levels, joints, strict=True):
         above = motions[-1][np.searchsorted(order[-1], level.parents)]
         carried = above[:, 3:] + cross(level.child - level.parent, above[:, :3])
-        relative = joint.turned - product(joint.by_parent, jnp.concatenate([above[:, :3], carried], axis=1))
+        relative = joint.turned - mv(joint.by_parent, jnp.concatenate([above[:, :3], carried], axis=1))
         velocity = carried + cross(level.child, relative) + level.closing
         motions.append(held(jnp.concatenate([above[:, :3] + relative, velocity], axis=1)))
         order.append(level.rows)
@@ -707,21 +707,15 @@ held = jax.lax.optimization_barrier
 
 
 def mv(matrix: Array, vector: Array) -> Array:
-    """Matrices (n, 3, 3, B) times vectors (n, 3, B)."""
-    a, b, c = (matrix[:, :, k] * vector[:, None, k] for k in range(3))
-    return a + b + c
-
-
-def product(matrix: Array, vector: Array) -> Array:
-    """Matrices (n, m, k, B) times vectors (n, k, B)."""
-    columns = [matrix[:, :, k] * vector[:, None, k] for k in range(matrix.shape[2])]
-    return sum(columns[1:], columns[0])
+    """Return matrices (n, m, k, B) times vectors (n, k, B)."""
+    parts = [matrix[:, :, k] * vector[:, None, k] for k in range(matrix.shape[2])]
+    return sum(parts[1:], parts[0])
 
 
 def mm(first: Array, second: Array) -> Array:
-    """Products of matrices (n, k, 3, B) and (n, 3, m, B)."""
-    a, b, c = (first[:, :, k, None] * second[:, None, k] for k in range(3))
-    return a + b + c
+    """Return products of matrices (n, l, k, B) and (n, k, m, B)."""
+    parts = [first[:, :, k, None] * second[:, None, k] for k in range(first.shape[2])]
+    return sum(parts[1:], parts[0])
 
 
 def cross(first: Array, second: Array) -> Array:

@@ -101,7 +101,7 @@ class Continued:
 
     @property
     def side_by_side(self) -> int:
-        """As the whole scene's dynamics say."""
+        """Return what the whole scene's dynamics say."""
         return side_by_side(self.dynamics)
 
     def rollout(self, state: jax.Array, controls: jax.Array, *, steps: jax.Array | None = None) -> jax.Array:

@@ -43,12 +43,12 @@ class Tried(NamedTuple):
     curvatures: Residuals  # c of each residual r: near the candidate its cost is a constant + sum(c r^2) / 2
 
     def rows(self, which: slice) -> Tried:
-        """Some of the candidates."""
+        """Return some of the candidates."""
         residuals, curvatures = ({name: each[which] for name, each in values.items()} for values in self[1:])
         return Tried(self.costs[which], residuals, curvatures)
 
     def row(self, index: int) -> Tried:
-        """One of the candidates alone, N = 1."""
+        """Return one of the candidates alone, N = 1."""
         return self.rows(slice(index, index + 1))
 
 

@@ -101,23 +101,18 @@ def _gained(body: Body, tied: Anchors, joints: list[Joined], root: Inertia, push
         halves.append(half)
         handed, below = held(carried_back(arm, own - mm(jnp.swapaxes(joint.half, 1, 2), half))), above
     at_root = with_children(every[:1], np.array([0]), handed, below)
-    motions, order = [_six(packed_inertia(root), at_root)], [np.array([0])]
+    motions, order = [mm(packed_inertia(root), at_root)], [np.array([0])]
     for (rows, above), joint, half in zip(levels, joints, reversed(halves), strict=True):
         parent = motions[-1][np.searchsorted(order[-1], above)]
         child, arm = tied.child[rows - 1], tied.child[rows - 1] - tied.parent[rows - 1]
         carried = parent[:, 3:] + cross_columns(arm, parent[:, :3])
         given = jnp.concatenate([parent[:, :3], carried], axis=1)
-        relative = held(mm(jnp.swapaxes(joint.solved, 1, 2), half) - _six(joint.by_parent, given))
+        relative = held(mm(jnp.swapaxes(joint.solved, 1, 2), half) - mm(joint.by_parent, given))
         velocity = carried + cross_columns(child, relative)
         motions.append(held(jnp.concatenate([parent[:, :3] + relative, velocity], axis=1)))
         order.append(rows)
     motion = jnp.concatenate(motions)[np.argsort(np.concatenate(order))]
     return Gains(motion[:, 3:], motion[:, :3])
-
-
-def _six(first: Array, second: Array) -> Array:
-    """Return products of matrices (n, k, 6, B) and (n, 6, m, B)."""
-    return mm(first[:, :, :3], second[:, :3]) + mm(first[:, :, 3:], second[:, 3:])
 
 
 def _twice(arrays: Arrays) -> Arrays:
