@@ -50,15 +50,11 @@ bench: $(READY)
 	$(RUN) tasks.benchmarks.stability --publish
 	$(RUN) tasks.benchmarks.page --kicks 200 --publish
 	for scene in chains1 chains2 human_ball; do $(RUN) tasks.train --scene $$scene --design paper --effort 0.5 || exit; done
-	$(MODEL) --scene human_ball --seed 1 --beside paper
+	$(MODEL) --scene human_ball --seed 2 --beside paper
 	for scene in chains1 chains2; do $(MODEL) --scene $$scene --seed 2 --beside paper --bullet || exit; done
 	$(MODEL) --scene chain4 --seed 2 --bullet
-	$(MODEL) --scene human_capsule --seed 2
-	$(MODEL) --scene any_human --seed 2
-	$(MODEL) --scene any_human_alone --seed 2
-	$(MODEL) --scene human_ball --weights larp_model/weights/any_human.json --seed 2
-	$(MODEL) --scene human_ball --weights larp_model/weights/any_human.json --seed 2 --bodies varied
-	$(MODEL) --scene full_human --seed 2 --bodies varied
+	for scene in human_capsule any_human any_human_alone full_human; do $(MODEL) --scene $$scene --seed 2 || exit; done
+	$(MODEL) --scene human_ball --seed 2 --bodies varied
 	$(RUN) tasks.benchmarks.gap --targets 8 --seed 7 --publish
 	for preset in fast balanced accurate; do $(RUN) tasks.benchmarks.kick --publish --targets 64 --seed 11 --preset $$preset || exit; done
 	for preset in fast balanced accurate; do $(KICK) --targets 32 --preset $$preset --substeps 20 || exit; done

@@ -1,7 +1,7 @@
 """A humanoid of one's own, from an MJCF file: MuJoCo's, as it comes with MuJoCo's MJX; 41 kg on legs of 0.87 m.
 
-Its capsules and hinges become our links and ball joints, or are refused by name: see `larp_model/mjcf.py`. MuJoCo plans
-for it at once. The shipped weights refuse it, because its joints sit elsewhere than those that they were trained with.
+Its capsules and hinges become our links and ball joints, or are refused by name: see `larp_model/mjcf.py`. It kicks at
+once, planned by our physics or by MuJoCo.
 """
 
 from dataclasses import replace

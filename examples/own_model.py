@@ -1,4 +1,4 @@
-"""A model of one's own for the planner: the learned simulator, and the wind of `own_world.py`.
+"""A model of one's own for the planner: ours, and the wind of `own_world.py`.
 
 A model has `differentiable` and `rollout(states, controls, *, steps=None)`: states (N, L, 13) and controls (N, H, J, 3)
 in, states (N, H', L, 13) out, of steps 1 to H' >= H. It is pure and traced by JAX; its rows know nothing of each other;
@@ -41,8 +41,8 @@ class InWind:
 def main() -> None:
     """In the wind, plans of a model that knows it miss by less than half."""
     kick = Kick.standard()
-    learned = models_of(kick.scene, "larp", kick.weights).whole
-    knowing = InWind(learned, kick.ball, kick.scene.links[kick.ball].radius + 0.01, kick.scene.dt)
+    ours = models_of(kick.scene, "larp").whole
+    knowing = InWind(ours, kick.ball, kick.scene.links[kick.ball].radius + 0.01, kick.scene.dt)
     blind, aware = (kick.to(TARGET, "fast", model, world=Windy(kick)) for model in ("larp", knowing))
     print(f"missed by {100 * blind.truth_error_m:.1f} cm without, {100 * aware.truth_error_m:.1f} cm with the wind")
     assert aware.truth_error_m < 0.5 * blind.truth_error_m

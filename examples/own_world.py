@@ -1,4 +1,4 @@
-"""A world of one's own: what the plan is executed in, here the learned simulator in a side wind; or a robot.
+"""A world of one's own: what the plan is executed in, here the simulator in a side wind; or a robot.
 
 A world has `reset(states)` and `step(control) -> states`: states (1, L, 13) of the whole scene, see `larp_model.state`;
 joint targets (1, J, 3), rotation vectors [rad]; a step lasts `scene.dt`, 10 ms. `reset` may move a robot to where it
@@ -18,10 +18,10 @@ WIND = np.array([0.0, 3.0, 0.0])
 
 
 class Windy:
-    """The human and the ball as the learned simulator knows them, and wind."""
+    """The human and the ball as the simulator knows them, and wind."""
 
     def __init__(self, kick: Kick) -> None:
-        self.simulator = Simulator.load("human_ball")
+        self.simulator = Simulator.of_physics(kick.scene)
         self.dt, self.ball, self.radius = kick.scene.dt, kick.ball, kick.scene.links[kick.ball].radius
 
     def reset(self, states: np.ndarray) -> None:

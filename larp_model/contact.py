@@ -1,4 +1,4 @@
-"""c(.): where two capsules are closest, when they meet within a step, and what a free impact would do.
+"""c(.): where two capsules are closest, and when they meet within a step.
 
 A ball is a capsule of length 0 and the ground a plane, so one description serves all contacts. All functions act on
 leading dimensions, are differentiable, and keep finite values and gradients for coincident, parallel and zero-length
@@ -12,7 +12,6 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from larp_model.scene import Surface
 from larp_model.vector import Vector
 
 # The share of the constraint that is a spring; the rest follows the free motion (MuJoCo's impedance).
@@ -38,18 +37,6 @@ class Closest(NamedTuple):
     distance: Array
     point: Array
     along: Array
-
-
-class Impact(NamedTuple):
-    """What a free impact does to the motion along the normal.
-
-    change: (*,) [m/s] of the separating velocity, against the same motion without contact. lag: (*,) [s] for which
-    that change acts on the position: it moves the bodies apart by change times lag. gap: (*,) [m] at the end.
-    """
-
-    change: Array
-    lag: Array
-    gap: Array
 
 
 def _dot(a: Array, b: Array) -> Array:
@@ -140,41 +127,6 @@ def time_of_impact(distance: Array, approach: Array, limit: Array | float) -> Ar
     closing = approach > 1e-3
     time = jnp.maximum(distance, 0.0) / jnp.where(closing, approach, 1.0)
     return jnp.where(closing | (distance <= 0.0), jnp.minimum(time, limit), limit)
-
-
-def impact(
-    depth: Array, approach: Array, acceleration: Array | float, surface: Surface, time: Array,
-    impedance: float = IMPEDANCE,
-) -> Impact:  # fmt: skip
-    """The damped spring of `surface`, solved in closed form over `time` (*,) [s] from touching bodies.
-
-    depth: (*,) [m] of penetration. approach: (*,) [m/s]. acceleration: [m/s^2] towards contact. The depth p follows
-    p'' = (1 - d) a - d (k p + b p'), d the impedance, until it returns to zero; then the bodies part.
-    """
-    decay = 0.5 * impedance * surface.damping
-    frequency = jnp.sqrt(max(impedance * surface.stiffness - decay**2, 0.01 * surface.stiffness))
-    equilibrium = (1.0 - impedance) * acceleration / (impedance * surface.stiffness)
-    offset = depth - equilibrium
-    rate = (approach + decay * offset) / frequency
-    at_rest = jnp.abs(rate) + jnp.abs(offset) < 1e-9
-    rate = jnp.where(at_rest, 1e-9, rate)
-    amplitude = jnp.sqrt(offset**2 + rate**2)
-    phase = jnp.arctan2(offset, rate)
-    balance = jnp.clip(equilibrium / amplitude, -0.999, 0.999)
-    # A motion smaller than the equilibrium never returns to zero.
-    until = jnp.where(equilibrium >= amplitude, time, (jnp.pi + jnp.arcsin(balance) - phase) / frequency)
-    touching = jnp.clip(until, 0.0, time)
-    angle, envelope = frequency * touching, jnp.exp(-decay * touching)
-    cosine, sine = envelope * jnp.cos(angle), envelope * jnp.sin(angle)
-    end_depth = offset * cosine + rate * sine + equilibrium
-    end_rate = (rate * frequency - decay * offset) * cosine - (offset * frequency + decay * rate) * sine
-    free = time - touching
-    change = jnp.maximum(approach + acceleration * touching - end_rate, 0.0)
-    gap = -end_depth - end_rate * free - 0.5 * acceleration * free**2
-    travel = gap + depth + approach * time + 0.5 * acceleration * time**2
-    meaningful = change > 1e-4
-    lag = jnp.clip(jnp.where(meaningful, travel / jnp.where(meaningful, change, 1.0), 0.5 * time), 0.0, time)
-    return Impact(change, lag, gap)
 
 
 def smooth_gate(gap: Array, margin: float) -> Array:

@@ -14,8 +14,8 @@ from jax import Array
 from larp_model import kinematics, launches, rotation
 from larp_model import state as packed
 from larp_model.errors import InputError
+from larp_model.learned.model import Model
 from larp_model.networks import Weights
-from larp_model.parts.part import Model, measure
 from larp_model.prediction import predict
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
@@ -82,8 +82,9 @@ def novelty(simulator: Simulator, states: np.ndarray, controls: np.ndarray) -> f
 
 @partial(jax.jit, static_argnums=0)
 def _novelty(model: Model, weights: Weights, before: Array, after: Array, controls: Array) -> Array:
-    seen = measure(model, before, after, controls, jnp.zeros((*before.shape[:2], 3)))
-    names = {name for part in model.bodies for name in part.networks()}
+    sizes = kinematics.morphology_of(model.scene)[None]
+    seen = model.measure(before, after, controls, jnp.zeros((*before.shape[:2], 3)), sizes)
+    names = [name for name in model.networks() if name.startswith("dynamics/")]
     return jnp.stack([weights.inputs[name].novelty(seen[name][0]) for name in sorted(names)]).max()
 
 

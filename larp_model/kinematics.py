@@ -38,13 +38,10 @@ class Kinematics(NamedTuple):
             self.morphology[:, rows],
         )  # fmt: skip
 
-    def segments(self, rows: np.ndarray, chosen: Array | None = None) -> Segment:
-        """The axes of links by their rows (P,), or of those chosen; see `picked`."""
-        centre, half, radius = (
-            picked(each[:, rows], chosen)
-            for each in (packed.position(self.state), self.halves, self.morphology[..., 1])
-        )
-        return Segment(centre, half, jnp.broadcast_to(radius, centre.shape[:2]))
+    def segments(self, rows: np.ndarray) -> Segment:
+        """Return the axes of links by their rows (P,)."""
+        centre, radius = packed.position(self.state)[:, rows], self.morphology[:, rows, 1]
+        return Segment(centre, self.halves[:, rows], jnp.broadcast_to(radius, centre.shape[:2]))
 
 
 def kinematics(scene: Scene, state: Array, morphology: Array) -> Kinematics:
@@ -58,20 +55,6 @@ def kinematics(scene: Scene, state: Array, morphology: Array) -> Kinematics:
 def apply(matrices: Array, vectors: Array) -> Array:
     """Vectors (*, 3) turned by matrices (*, 3, 3)."""
     return jnp.sum(matrices * vectors[..., None, :], axis=-1)
-
-
-def picked(values: Array, chosen: Array | None) -> Array:
-    """Of values (B or 1, P, ...) those chosen, (B, K, ...), by one-hot rows (B, K, P); all P where there are none.
-
-    Exact, and NaN elsewhere does not matter. A gather would take longer.
-    """
-    if chosen is None or values.shape[1] == 1:
-        return values
-    found = values[:, :1]
-    for row in range(1, values.shape[1]):
-        which = chosen[:, :, row].reshape(*chosen.shape[:2], *[1] * (values.ndim - 2))
-        found = jnp.where(which, values[:, row : row + 1], found)
-    return found
 
 
 def morphology_of(scene: Scene) -> Array:

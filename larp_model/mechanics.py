@@ -26,7 +26,6 @@ from jax import Array
 
 from larp_model import rotation
 from larp_model import state as packed
-from larp_model.compliance import HELD, moments, resisting, stiffening
 from larp_model.kinematics import anchors, strength
 from larp_model.scene import Body, Vector
 
@@ -37,21 +36,14 @@ GAMMA = 1.0 - math.sqrt(0.5)
 class Constants:
     """What is chosen here, not derived.
 
-    closing: share of a joint's displacement that a step takes back (J. Baumgarte, Computer Methods 1 (1972)). standing,
-    sliding: an end that stands on the ground is held as if by so many times its body's mass, one that slides by so
-    many: held harder, a direction of sliding that is half a step old throws the body. held: see `compliance.HELD`.
-    products: what velocity products do to an end on the ground is left out, as in MuJoCo (`velocity_products`).
-    rounds: Newton steps in which the ground's forces are found, all of them at once, and what slides is held like what
-    stands (`reaction`). 0: which end stands, slides or lifts is decided beforehand, each as if its link were free
-    (`Ends.decided`): quicker, and three times further from the truth after 0.1 s of motion and more.
+    closing: share of a joint's displacement that a step takes back (J. Baumgarte, Computer Methods 1 (1972)). standing:
+    an end in the ground is held as if by so many times its body's mass. rounds: Newton steps in which the ground's
+    forces are found, all of them at once (`reaction`).
     """
 
     closing: float = 0.2
-    standing: float = 8.0
-    sliding: float = 0.2
-    held: float = HELD
-    rounds: int = 0
-    products: bool = False
+    standing: float = 3.0
+    rounds: int = 3
 
 
 class BodyMotion(NamedTuple):
@@ -171,13 +163,8 @@ def articulated_motion(
             bears, pushed = held(jax.tree.map(jnp.add, (inertia, push), bearing))
             return solve(bears, pushed, levels)
 
-        gains = velocity_products(body, tied, spin) if constants.products else None
-        ends = Ends.of(body, before, height, velocity, spin, sizes, h, gains)
+        ends = Ends.of(body, before, height, velocity, spin, sizes, h, velocity_products(body, tied, spin))
         whole = jnp.sum(jnp.broadcast_to(mass, velocity[:, :1].shape), axis=0, keepdims=True)
-        if not constants.rounds:
-            return parting(ends.decided(body, velocity, spin, gravity, h, constants, whole)), Articulation(
-                inertia, tied
-            )
         firm = constants.standing * whole
 
         def round_of(guess: tuple[Array, Array, Array], nothing: None) -> tuple[tuple[Array, Array, Array], None]:
@@ -229,117 +216,6 @@ def velocity_products(body: Body, tied: Anchors, spin: Array) -> tuple[Array, Ar
     return velocity[order], turning[order]
 
 
-def impulse_response(
-    body: Body, state: Array, push: Array, morphology: Array, constants: Constants = Constants(),
-    acting: Array | None = None,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Velocities and spins (B, n, 3) that the links of a body in states (B, n, 13) gain from impulses.
-
-    push (B, n, 6): impulse [N s] and moment [N m s] about each link's centre; morphology (B or 1, n, 3). Joints pass on
-    impulses, and moments as far as servos stiffen them at once, or within the time (B,) [s] for which the impulses have
-    been acting; the ground is not asked.
-    """
-    state, push, sizes = (jnp.moveaxis(each, 0, -1) for each in (state, push, morphology))
-    matrices = turns(state[:, packed.ORIENTATION])
-    tied = turned_anchors(body, local_anchors(body, sizes), matrices)
-    still = jnp.zeros_like(push[1:, :3])
-    stronger = strength(body, morphology)
-    stiff = [
-        jnp.broadcast_to(
-            stiffening(each, constants.held, stronger) if acting is None else resisting(each, acting, stronger),
-            push.shape[-1:],
-        )
-        for each in body.joints
-    ]
-    hold = jnp.reshape(jnp.array(stiff), (-1, 1, 1, push.shape[-1])) * jnp.eye(3, dtype=push.dtype)[..., None]
-    levels = [
-        Level(rows, parents, *(each[rows - 1] for each in (*tied, still, still, hold))) for rows, parents in tree(body)
-    ]
-    gained = solve(inertias(body, matrices, sizes), Momenta(push[:, 3:], push[:, :3]), levels)
-    velocity, spin = (jnp.moveaxis(each, -1, 0) for each in gained)
-    return velocity, spin
-
-
-def fading(
-    body: Body, rows: np.ndarray, matrices: Array, morphology: Array, times: tuple[float, ...]
-) -> tuple[Array, ...]:
-    """What P links of a body have gained, t after a unit impulse: w(t) = W_0 + sum of W_i exp(-t / T_i).
-
-    W_i: (B, P, 6, 6) each, velocity and spin by impulse and moment about the links' centres; W_0 is the first of them.
-    times: T_i [s]. What is gained fades as servos and dampers pull the links back, and of that w `responses` know
-
-        integral of w(t) exp(-t / T) dt / T = W(T)
-
-    which is made right at once and at all T_i. The rest is as in `responses`.
-    """
-    after = (0.0, *times)
-    known = responses(body, rows, matrices, morphology, after)
-    faded = np.array([[1.0, *(time / (time + passed) for time in times)] for passed in after])
-    return tuple(jnp.tensordot(jnp.asarray(line, known.dtype), known, 1) for line in np.linalg.inv(faded))
-
-
-def responses(body: Body, rows: np.ndarray, matrices: Array, morphology: Array, after: tuple[float, ...]) -> Array:
-    """W(T) = C (M + T D + T^2 K)^-1 C' (times, B, P, 6, 6) of P links of a body, for all times T [s] in `after`.
-
-    Velocity and spin that a link gains by an impulse and a moment about its centre, all others tied to it by joints
-    that resist as after that time: see `compliance.resisting`. From the root outwards, with a joint's S, and D that
-    resists its turning,
-
-        W_i = L W_p L' + S D^-1 S',    L = (1 - S D^-1 S' A_i) X_i
-
-    rows: (P,). matrices: (B, n, 3, 3) rotations of all links. morphology (B or 1, n, 3).
-    """
-    count = matrices.shape[0]
-    morphology = jnp.broadcast_to(morphology, (count, *morphology.shape[1:]))
-    matrices, sizes = (jnp.tile(jnp.moveaxis(each, 0, -1), len(after)) for each in (matrices, morphology))
-    passed, stronger = (
-        jnp.repeat(jnp.asarray(after, matrices.dtype), count),
-        jnp.tile(strength(body, morphology), len(after)),
-    )
-    tied = turned_anchors(body, local_anchors(body, sizes), matrices)
-    unit, still = jnp.eye(3, dtype=matrices.dtype)[..., None], jnp.zeros_like(matrices[:, 0])
-    stiff = jnp.array([resisting(each, passed, stronger) for each in body.joints], matrices.dtype)
-    hold = jnp.reshape(stiff, (-1, 1, 1, passed.shape[0])) * unit
-    levels = [
-        Level(links, parents, *(each[links - 1] for each in (*tied, still[1:], still[1:], hold)))
-        for links, parents in tree(body)
-    ]
-    whole, _, joined = inwards(inertias(body, matrices, sizes), Momenta(still, still), levels)
-    gives = {0: inverse(whole)}
-    # A scan over levels, filled up to as many links of each, because as many copies take long to compile.
-    needed = _ancestry(body, rows)
-    lines = [line for level in levels if len(line := level.rows[np.isin(level.rows, needed)])]
-    most = max(map(len, lines), default=0)
-    lines = [np.resize(line, most) for line in lines]
-    given, last = [], np.zeros(most, int)
-    for line, level, joint in zip(lines, levels, joined, strict=False):
-        at = np.searchsorted(level.rows, line)
-        above = np.array([np.flatnonzero(last == parent)[0] for parent in level.parents[at]])
-        arrays = level.child, level.child - level.parent, joint.by_parent, joint.solved
-        given.append((above, *(each[at] for each in arrays)))
-        last = line
-    if given:
-        start = Inertia(*(jnp.repeat(block, most, axis=0) for block in gives[0]))
-        _, found = jax.lax.scan(_outwards, start, jax.tree.map(lambda *each: jnp.stack(each), *given))
-        for number, line in enumerate(lines):
-            gives |= {row: Inertia(*(each[number, i : i + 1] for each in found)) for i, row in enumerate(line)}
-    chosen = Inertia(*(jnp.concatenate(each) for each in zip(*(gives[row] for row in rows), strict=True)))
-    mixed = jnp.swapaxes(chosen.mixed, 1, 2)
-    blocks = ((chosen.moving, mixed), (chosen.mixed, chosen.turning))
-    matrix = jnp.concatenate([jnp.concatenate(row, axis=2) for row in blocks], axis=1)
-    return jnp.moveaxis(matrix.reshape(len(rows), 6, 6, len(after), count), (3, 4), (0, 1))
-
-
-def _ancestry(body: Body, rows: np.ndarray) -> list[int]:
-    """Links and all that are on their way to the root."""
-    found: list[int] = []
-    for row in map(int, rows):
-        while row and row not in found:
-            found.append(row)
-            row = body.joints[row - 1].parent
-    return found
-
-
 def inverse(inertia: Inertia) -> Inertia:
     """From momenta to spin and velocity."""
     still = invert(inertia.moving)
@@ -347,38 +223,6 @@ def inverse(inertia: Inertia) -> Inertia:
     turning = invert(inertia.turning - mm(lever, jnp.swapaxes(inertia.mixed, 1, 2)))
     mixed = -mm(turning, lever)
     return Inertia(turning, mixed, still - mm(jnp.swapaxes(lever, 1, 2), mixed))
-
-
-def _outwards(parents: Inertia, given: tuple[Array, Array, Array, Array, Array]) -> tuple[Inertia, Inertia]:
-    """How the links of a level give way, twice over, from how those of the one before do; see `responses`.
-
-    given: which of those are their parents, `Level.child`, the way from `Level.parent` to it, `Joined.by_parent` and
-    `Joined.solved`.
-    """
-    above, child, arm, by_parent, solved = given
-    to_turn, to_move = by_parent[:, :, :3], by_parent[:, :, 3:]
-    parent = Inertia(*(block[above] for block in parents))
-    unit = jnp.broadcast_to(jnp.eye(3, dtype=child.dtype)[..., None], to_turn.shape)
-    by_turn = -to_turn - cross_rows(to_move, arm)
-    # L, to spin and to velocity, from the parent's spin and velocity
-    to_spin = unit + by_turn, -to_move
-    to_velocity = cross_columns(arm, unit) + cross_columns(child, by_turn), unit - cross_columns(child, to_move)
-    mixed = jnp.swapaxes(parent.mixed, 1, 2)
-    half = [
-        (mm(one, parent.turning) + mm(two, mixed), mm(one, parent.mixed) + mm(two, parent.moving))
-        for one, two in (to_spin, to_velocity)
-    ]
-
-    def whole(first: tuple[Array, Array], second: tuple[Array, Array]) -> Array:
-        return mm(first[0], jnp.swapaxes(second[0], 1, 2)) + mm(first[1], jnp.swapaxes(second[1], 1, 2))
-
-    turns = mm(jnp.swapaxes(solved, 1, 2), solved)
-    aside = -cross_rows(turns, child)
-    own = Inertia(
-        whole(half[0], to_spin) + turns, whole(half[0], to_velocity) + aside,
-        whole(half[1], to_velocity) + cross_columns(child, aside),
-    )  # fmt: skip
-    return own, own
 
 
 def tree(body: Body) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -445,6 +289,16 @@ def turned_anchors(body: Body, local: Anchors, matrices: Array) -> Anchors:
     return Anchors(mv(matrices[1:], local.child), mv(matrices[parents], local.parent))
 
 
+def moments(length: Array, radius: Array, mass: Array) -> tuple[Array, Array]:
+    """Return moments of inertia (*,) [kg m^2] of solid capsules, about their axis and across it."""
+    sphere = 4.0 / 3.0 * radius / (length + 4.0 / 3.0 * radius)
+    rod, caps = mass * (1.0 - sphere), mass * sphere
+    along = (0.5 * rod + 0.4 * caps) * radius**2
+    across = rod * (length**2 / 12.0 + radius**2 / 4.0)
+    across += caps * (0.4 * radius**2 + length**2 / 4.0 + 0.375 * length * radius)
+    return along, across
+
+
 def inertias(body: Body, matrices: Array, sizes: Array) -> Inertia:
     """Of the links alone, in world axes."""
     along, across = moments(sizes[:, 0], sizes[:, 1], sizes[:, 2])
@@ -504,7 +358,7 @@ class Ends(NamedTuple):
     @staticmethod
     def of(
         body: Body, matrices: Array, height: Array, velocity: Array, spin: Array, sizes: Array, h: float,
-        gains: tuple[Array, Array] | None = None,
+        gains: tuple[Array, Array],
     ) -> Ends:  # fmt: skip
         """Return the ends of links by rotations (n, 3, 3, B), heights (n, 1, B) [m] and first velocities (n, 3, B).
 
@@ -515,8 +369,7 @@ class Ends(NamedTuple):
         half, down = 0.5 * sizes[:, :1] * mv(matrices, axes), sizes[:, 1:2] * upright
         arm = jnp.concatenate([half - down, -half - down])
         speed, clearance = twice(velocity) + cross(twice(spin), arm), twice(height) + arm[:, 2:]
-        if gains is not None:
-            speed += h * (twice(gains[0]) + cross(twice(gains[1]), arm))
+        speed += h * (twice(gains[0]) + cross(twice(gains[1]), arm))
         damped = 1.0 + h * surface.damping
         rising = (speed[:, 2:] - h * surface.stiffness * clearance) / (damped + h**2 * surface.stiffness)
         return Ends(arm, clearance, speed * (1.0 - upright) / damped + rising * upright)
@@ -524,36 +377,6 @@ class Ends(NamedTuple):
     def velocity(self, velocity: Array, spin: Array) -> Array:
         """The ends' velocities (2 n, 3, B), from the links'."""
         return twice(velocity) + cross(twice(spin), self.arm)
-
-    def decided(
-        self,
-        body: Body,
-        velocity: Array,
-        spin: Array,
-        gravity: float,
-        h: float,
-        constants: Constants,
-        mass: Array,
-    ) -> tuple[Inertia, Momenta]:
-        """What they add to their links' inertia and push where each is judged as if its link were free.
-
-        Where an end is in the ground, a large share of the body's mass (1, 1, B) [kg] that moves as the ground allows
-        holds it. Friction wants it to stand; what slides is held along the direction of the sliding force alone. Of a
-        body that falls freely it would be a law; where joints pull, the network corrects it.
-        """
-        friction, damped = body.surface.friction, 1.0 + h * body.surface.damping
-        upright, unit = _upright(self.arm), jnp.eye(3, dtype=self.arm.dtype)[..., None]
-        speed = self.velocity(velocity, spin)
-        falling = speed[:, 2:] - h * gravity
-        pressed = self.allowed[:, 2:] - falling  # the change of speed that the ground makes
-        bearing = ramp(-self.clearance - h * falling, 1e-5) * ramp(pressed, 1e-3)
-        sliding = speed * (1.0 - upright)
-        slip = jnp.sqrt(jnp.sum(sliding**2, axis=1, keepdims=True) + 1e-8)
-        sticks = ramp(friction * pressed - slip * (damped - 1.0) / damped, 1e-3)[:, None]
-        along = upright - friction * sliding / slip
-        loosely = constants.sliding * along[:, :, None] * along[:, None]
-        hold = (mass * bearing)[:, None] * (sticks * constants.standing * unit + (1.0 - sticks) * loosely)
-        return self.held_by(hold, mv(hold, self.allowed))
 
     def found(self, guess: Array, met: Array, firm: Array, friction: float) -> tuple[Inertia, Momenta]:
         """What they add to their links' inertia and push: the ground's impulses, linear around velocities `guess`.

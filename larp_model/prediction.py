@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from larp_model.learned.model import Model
 from larp_model.networks import Weights
-from larp_model.parts.part import Model
 from larp_model.simulator import Simulator
 
 # Steps, to whose multiples rollouts are filled up: one program, then, serves all windows of a kick.

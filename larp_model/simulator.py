@@ -1,14 +1,12 @@
-"""LARP: a step is what bodies do alone, where they meet, and what that does to them; a rollout repeats it.
+"""LARP: a step is how bodies move and touch, by the model of a scene and its weights; a rollout repeats it.
 
-M. Andriluka et al., "Learned neural physics simulation for articulated 3D human pose reconstruction" (2024), in the
-parts of a `Model`.
+After M. Andriluka et al., "Learned neural physics simulation for articulated 3D human pose reconstruction" (2024).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -16,84 +14,34 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike, DTypeLike
 
-from larp_model import designs
 from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.errors import InputError
-from larp_model.kinematics import Kinematics, kinematics, morphology_of
-from larp_model.mechanics import BodyMotion
-from larp_model.meeting import Velocities
-from larp_model.names import require_known
+from larp_model.kinematics import morphology_of
+from larp_model.learned.model import Model
+from larp_model.learned.residual import ResidualModel
 from larp_model.networks import Weights
-from larp_model.parts.part import BodyPart, Hits, Model, PairPart
-from larp_model.parts.residual import FreeBall, ResidualBody, SoftContact
-from larp_model.physics.collision import ContactSettings
-from larp_model.physics.step import step as physics_step
 from larp_model.runtime import remember_compilations
-from larp_model.scene import Body, Scene
+from larp_model.scene import Scene
 
 
 def step(
     model: Model, weights: Weights, state: Array, control: Array, torque: Array | None = None,
     morphology: Array | None = None, stop_gradient: bool = False,
 ) -> Array:  # fmt: skip
-    """Advance states (B, L, 13) by the scene's time step under joint targets (B, J, 3) [rad].
+    """Return states (B, L, 13) one time step of the scene after states (B, L, 13).
 
-    torque: external, (B, L, 3) [N m], world frame. morphology (B or 1, L, 3); the scene's by default.
-    stop_gradient: hold the contact's inputs fixed, as in the paper's training; never when planning.
+    control: joint targets (B, J, 3) [rad]. torque: external, (B, L, 3) [N m], world frame; none by default. morphology
+    (B or 1, L, 3); the scene's by default. stop_gradient: as in the paper's training; never when planning.
     """
-    scene = model.scene
     torque = jnp.zeros((*state.shape[:-1], 3), state.dtype) if torque is None else torque
-    sizes = morphology_of(scene)[None].astype(state.dtype) if morphology is None else morphology
-    if isinstance(model.bodies[0], ResidualBody | FreeBall):
-        return _over_physics(model, weights, state, control, torque, sizes)
-    bodies = cast(tuple[BodyPart, ...], model.bodies)
-    seen = model.each(kinematics(scene, state, sizes))
-    moving = [
-        part.move(weights, own, control[:, scene.motor_rows(part.body.name)], torque[:, scene.rows(part.body.name)])
-        for part, own in zip(bodies, seen, strict=True)
-    ]
-    free = [each.free for each in moving]
-    hits = pooled(model, weights, *(jax.lax.stop_gradient((seen, free)) if stop_gradient else (seen, free)))
-    after = [
-        part.respond(weights, own, moved, hit) for part, own, moved, hit in zip(bodies, seen, moving, hits, strict=True)
-    ]
-    return jnp.concatenate(after, axis=1)
-
-
-def _over_physics(model: Model, weights: Weights, state: Array, control: Array, torque: Array, sizes: Array) -> Array:
-    """Return the states after a step of physics, in which networks correct how bodies move by themselves."""
-    scene, parts = model.scene, {part.body.name: part for part in model.bodies}
-
-    def correct(body: Body, before: Array, own: Array, motion: BodyMotion, dt: float) -> BodyMotion:
-        part = parts[body.name]
-        if not isinstance(part, ResidualBody) or part.size is None:
-            return motion
-        seen = kinematics(scene.only(body.name), *(jnp.moveaxis(each, -1, 0) for each in (before, own)))
-        corrected = part.corrected(weights, seen, BodyMotion(*(jnp.moveaxis(each, -1, 0) for each in motion)), dt)
-        return BodyMotion(*(jnp.moveaxis(each, 0, -1) for each in corrected))
-
-    constants = {name: part.constants for name, part in parts.items() if isinstance(part, ResidualBody)}
-    found = (part.settings for part in model.pairs if isinstance(part, SoftContact))
-    settings = next(found, ContactSettings())
-    return physics_step(scene, state, control, torque, sizes, constants, settings, correct)
-
-
-def pooled(model: Model, weights: Weights, seen: list[Kinematics], free: list[Velocities]) -> list[Hits]:
-    """Sum f_c over the contacts of every link, body by body (equation 1 of the paper)."""
-    hits = [Hits.none(own) for own in seen]
-    for pair in cast(tuple[PairPart, ...], model.pairs):
-        both = model.of(pair)
-        first, second = both
-        met = pair.meet(weights, (seen[first], seen[second]), (free[first], free[second]))
-        for index, found in zip(both, met, strict=True):
-            hits[index] = hits[index].plus(found)
-    return hits
+    sizes = morphology_of(model.scene)[None].astype(state.dtype) if morphology is None else morphology
+    return model.step(weights, state, control, torque, sizes, stop_gradient)
 
 
 @dataclass(frozen=True, eq=False)
 class Simulator:
-    """A scene with learned weights: pure, jit-able, batched, differentiable."""
+    """A model of a scene, with its weights: pure, jit-able, batched, differentiable."""
 
     model: Model
     weights: Weights
@@ -102,28 +50,24 @@ class Simulator:
 
     @property
     def side_by_side(self) -> int:
-        """Return how many rollouts are cheapest side by side on a CPU: physics is made of many small loops."""
-        return 32 if isinstance(self.model.bodies[0], ResidualBody | FreeBall) else 8
+        """Return how many rollouts are cheapest side by side on a CPU."""
+        return self.model.side_by_side
 
     @staticmethod
     def load(weights: str | Path, scene: Scene | None = None) -> Simulator:
-        """The simulator of weights by their manifest, or of shipped ones by their name ("human_ball", "chains2", ...).
+        """Return the simulator of weights by their manifest.
 
         scene: that is to be simulated; what the weights were trained on by default. What is compiled is kept from one
         process to the next: see `runtime.remember_compilations`.
         """
         remember_compilations()
-        manifest = Path(weights)
-        if manifest.name == str(weights) and not manifest.suffix:
-            require_known("weights", str(weights), sorted(each.stem for each in stored.SHIPPED.glob("*.json")))
-            manifest = stored.SHIPPED / f"{weights}.json"
-        return Simulator(*stored.load(manifest, scene)[:2])
+        return Simulator(*stored.load(Path(weights), scene)[:2])
 
     @staticmethod
     def of_physics(scene: Scene) -> Simulator:
         """Return the simulator of any scene with nothing learned."""
         remember_compilations()
-        return Simulator(designs.physical(scene), Weights({}, {}, {}))
+        return Simulator(ResidualModel(scene), Weights({}, {}, {}))
 
     @property
     def scene(self) -> Scene:

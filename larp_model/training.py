@@ -1,4 +1,4 @@
-"""Algorithm 1 of the paper: unrolled loss, curriculum, gradient clipping and dropping, resume."""
+"""Training, which goes on if cut off: residual networks on single steps, others by the paper's Algorithm 1."""
 
 from __future__ import annotations
 
@@ -21,14 +21,17 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from larp_model import losses, rotation
 from larp_model.errors import InputError
+from larp_model.learned.model import Model, initial_weights
+from larp_model.learned.residual import ResidualModel
 from larp_model.losses import LossWeights
-from larp_model.meeting import first_contacts
+from larp_model.meeting import first_contacts, meetings
 from larp_model.networks import Weights
-from larp_model.parts.part import Model, initial_weights, measure
 from larp_model.scene import Scene
 from larp_model.simulator import rollout
 from larp_model.state import Trajectories
 
+# Errors of residual networks beyond this, in standard deviations, count linearly.
+LARGE = 0.1
 # Updates by which it is judged how many fit into a time.
 TIMED = 20
 
@@ -145,7 +148,7 @@ def statistics_of(model: Model, windows: Windows, random: np.random.Generator, b
     if not model.invariant:
         states = np.asarray(rotation.turn_states(jnp.asarray(states), turns[:, None]))
     step = states[:, 0], states[:, 1], controls[:, 0], torques[:, 0], morphology
-    found = jax.jit(partial(measure, model))(*step)
+    found = jax.jit(model.measure)(*step)
     return initial_weights(model, jax.random.key(int(random.integers(2**31))), found)
 
 
@@ -191,9 +194,12 @@ def update_of(model: Model, recipe: Recipe, weights: Weights) -> Update:
     weigh, (_, fixed) = emphasis(scene, recipe), recipe.split(weights.networks)
 
     def loss_of(networks: dict[str, Any], states: Array, drawn: Any) -> tuple[Array, dict[str, Array]]:
+        whole = weights._replace(networks=fixed | networks)
+        if isinstance(model, ResidualModel):
+            return step_loss(model, whole, states, drawn)
         predicted = rollout(
-            model, weights._replace(networks=fixed | networks), states[:, 0], drawn.controls, drawn.torques,
-            drawn.morphology, stop_gradient=recipe.stop_gradient,
+            model, whole, states[:, 0], drawn.controls, drawn.torques, drawn.morphology,
+            stop_gradient=recipe.stop_gradient,
         )  # fmt: skip
         return losses.total(scene, recipe.loss, weigh, predicted, states[:, 1:], drawn.morphology)
 
@@ -219,6 +225,25 @@ def update_of(model: Model, recipe: Recipe, weights: Weights) -> Update:
         )
 
     return update
+
+
+def step_loss(model: ResidualModel, weights: Weights, states: Array, drawn: Any) -> tuple[Array, dict[str, Array]]:
+    """Return how far networks are from what physics lacks in the first steps of windows (B, T + 1, L, 13).
+
+    In standard deviations; beyond `LARGE` errors count linearly. Steps in which links of two bodies touch are left
+    out. Physics is asked once, and not differentiated.
+    """
+    before, after = states[:, 0], states[:, 1]
+    apart = jnp.ones(len(states))
+    for _, meeting in meetings(model.scene, before, drawn.morphology, after):
+        apart *= 1.0 - jnp.max(meeting.near, axis=1)
+    apart /= jnp.maximum(jnp.sum(apart), 1.0)
+    loss = jnp.zeros(())
+    given = drawn.controls[:, 0], drawn.torques[:, 0], drawn.morphology
+    for name, inputs, outputs in model.examples(before, after, *given):
+        error = model.answer(weights, name, inputs) - weights.outputs[name].normalise(outputs)
+        loss += jnp.sum(apart * jnp.mean(losses.pseudo_huber(error**2, LARGE), axis=1))
+    return loss, {}
 
 
 def train(
@@ -279,7 +304,7 @@ def train(
                 log["history"].append(
                     {"update": index + 1, "unroll": recipe.unroll(index), **mean, "sequences_per_second": rate}
                 )
-                note = f"loss {mean['loss']:.3g} position {mean['position'] ** 0.5:.4f} m {rate:.0f} sequences/s"
+                note = f"loss {mean['loss']:.3g}, {rate:.0f} sequences/s"
                 bar.update(task, completed=index + 1, note=note)
                 with (folder / "history.jsonl").open("a") as file:
                     file.write(json.dumps(log["history"][-1]) + "\n")

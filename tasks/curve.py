@@ -33,8 +33,8 @@ def curve_picture(stages: Sequence[Path], path: Path) -> None:
     for stage, rows in logged.items():
         updates = begin + np.array([row["update"] for row in rows])
         for name, colour in zip(DRAWN, COLOURS, strict=True):
-            values = [row.get(name, np.nan) for row in rows]
-            axes.plot(updates, values, color=colour, lw=1.5, label=None if begin else name)
+            if name in rows[0]:
+                axes.plot(updates, [row[name] for row in rows], color=colour, lw=1.5, label=None if begin else name)
         axes.axvline(begin, color="#d5dae0", lw=1.0, zorder=0)
         axes.text(begin, 0.98, f" {stage}", va="top", transform=axes.get_xaxis_transform(), color="#5b6470")
         begin = float(updates[-1])

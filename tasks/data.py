@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from larp_model import state as packed
 from larp_model.bodies import segment_of
 from larp_model.kinematics import morphology_of
-from larp_model.meeting import first_contacts, meetings
+from larp_model.meeting import meetings
 from larp_model.rotation import turned_about_z
 from larp_model.scene import Link, Scene
 from larp_model.truth.episodes import Episodes, record
@@ -22,7 +22,7 @@ from larp_model.truth.mujoco import Truth, closed
 from tasks.motions.people import random_people
 from tasks.motions.references import Reference, clearance, resting
 
-STEPS, CONTACT_STEPS = 70, 10
+STEPS = 70
 # How far random joint targets stray from the reference, standard deviation by segment [rad]; the planner's too.
 STRAY = {
     "abdomen": 0.08,
@@ -208,40 +208,6 @@ def pushes(random: np.random.Generator, scene: Scene, count: int, steps: int) ->
     drawn = random.standard_normal((len(pushed), 1, human.stop - human.start, 3))
     torques[pushed, :10, human] = 4.0 * np.minimum(scene.morphology[human, 2:] / LIGHT, 1.0) * drawn
     return torques
-
-
-def contact_episodes(
-    scene: Scene, source: Episodes, count: int, seed: int, steps: int = CONTACT_STEPS
-) -> tuple[Episodes, int]:
-    """Short episodes that start just before first contacts of recorded ones, disturbed: impacts at a low price.
-
-    Returns them and how many diverged and were dropped.
-    """
-    random = np.random.default_rng(seed)
-    contacts = first_contacts(scene.between, source)
-    # In order, so that a body is built once for all its episodes.
-    rows = np.sort(random.choice(np.flatnonzero((contacts >= 0) & (contacts + steps <= source.steps)), count))
-    begin = np.maximum(contacts[rows] - random.integers(0, 4, count), 0)
-    states, sizes = source.states[rows, begin].astype(float), source.morphology[rows]
-    columns = begin[:, None] + np.arange(steps)
-    human, pair = scene.rows("human"), scene.between.pairs[0]
-    struck = scene.index(pair.second, pair.second_links[0])
-    size = random.uniform(0.0, 1.0, (count, 1, 1))
-    states[:, human, packed.ANGULAR_VELOCITY] += 2.0 * size * random.standard_normal(states[:, human, 10:].shape)
-    states[:, human.start, packed.VELOCITY] += 0.4 * size[:, 0] * random.standard_normal((count, 3))
-    place = states[:, struck]
-    place[:, packed.POSITION] += 0.03 * size[:, 0] * random.standard_normal((count, 3)) * (1.0, 1.0, 0.3)
-    place[:, 2] = np.maximum(place[:, 2], resting(scene.links[struck], place))
-    place[:, packed.VELOCITY] *= random.uniform(0.5, 1.5, (count, 1))
-    controls = source.controls[rows[:, None], columns] + 0.5 * size[..., None] * smooth_noise(
-        random, count, steps, 4, stray(scene)
-    )
-    torques = source.torques[rows[:, None], columns]
-    apart = ~overlaps(scene, states, sizes)
-    varied = not np.allclose(sizes, scene.morphology)
-    return record(
-        Truth(scene, batch=256), states[apart], controls[apart], torques[apart], sizes[apart] if varied else None
-    )
 
 
 def random_roll(random: np.random.Generator, fastest: float) -> np.ndarray:

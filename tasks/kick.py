@@ -169,10 +169,10 @@ def main(
         target: where the ball's centre should pass [m]: forwards, to the left, up.
         preset: how much a plan may cost.
         change: fields of the preset to change: every=2 again.0.rounds=3 "verify=(4, 2)".
-        dynamics: the planner's model: larp (learned), physics (nothing is learned) or mujoco.
+        dynamics: the planner's model: larp or mujoco.
         reference: a captured kick (BVH, or npz of joint angles) instead of the embedded one.
         names: JSON object of what the BVH file calls our joints: {"Hips": "pelvis", ...}; known skeletons need none.
-        weights: manifest of the weights of the learned model; those shipped for the kick by default.
+        weights: manifest of weights that correct larp's physics; none by default.
         height: of the human [m].
         mass: of the human [kg]; as heavy as its height squared by default.
         body: lean: 13 links; full: 26, with a spine, hands and toes.

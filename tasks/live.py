@@ -17,12 +17,11 @@ import jax
 import numpy as np
 
 from larp_model import state as packed
-from larp_model import weights as stored
 from larp_model.errors import InputError
 from larp_model.scene import Scene
 from larp_model.truth.mujoco import Truth
 from mpc.loop import Diverged, Execution, Replan, Window
-from tasks.models import DynamicsName, Models
+from tasks.models import NO_WEIGHTS, DynamicsName, Models
 from tasks.presets import Preset
 from tasks.task import REACHABLE, Planners, Run, Task
 from viewer import (
@@ -55,7 +54,7 @@ class Choices(NamedTuple):
     tasks: Mapping[str, Callable[[], Task]]
     presets: Mapping[str, Preset]
     dynamics: tuple[DynamicsName, ...]
-    weights: Mapping[str, Path]
+    weights: Mapping[str, Path | None]
 
     def offer(self, task: Task) -> Offer:
         """What the page says of them."""
@@ -64,16 +63,10 @@ class Choices(NamedTuple):
         return Offer(*names, terms, TARGETS, SPOTS, ROLLS)
 
 
-def weights_for(task: Task, chosen: Path | None) -> dict[str, Path]:
-    """The weights that this task's scene takes, by name, those chosen, or the usual ones, first."""
-    known: dict[str, Path] = {}
-    for path in (chosen or task.weights, *sorted(stored.SHIPPED.glob("*.json"))):
-        try:
-            stored.load(path, task.scene)
-        except InputError:
-            continue
-        known.setdefault(path.stem, path)
-    return known
+def weights_for(task: Task, chosen: Path | None) -> dict[str, Path | None]:
+    """Return the weights that may be chosen, by name, the usual ones first: the task's or others, and none."""
+    usual = chosen or task.weights
+    return ({} if usual is None else {usual.stem: usual}) | {NO_WEIGHTS: None}
 
 
 class Pushed:

@@ -20,7 +20,6 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
-from larp_model import weights as stored
 from larp_model.bodies import human, standing_height
 from larp_model.errors import InputError
 from larp_model.files import require_writable, write_whole
@@ -39,30 +38,20 @@ from tasks.keypoints.points import Keypoints, interpolated
 from tasks.models import ROWS, DynamicsName
 from tasks.motions import angles, bvh
 from tasks.presets import PresetName
-from tasks.scenarios import ANY_HUMAN_ALONE
 from viewer import Overlay, write_overlay
 
 # Of states and controls [s], as every scene's by default.
 DT = 0.01
-# Of the learned model, whatever a film shows.
-MANIFEST = stored.SHIPPED / f"{ANY_HUMAN_ALONE}.json"
 # Keypoints are shown so far before the points they belong to [m], or these would hide them.
 BEFORE = 0.2
 # What is done is kept every so many seconds.
 OFTEN = 5.0
-# Heights of people [m] that the weights know.
+# Heights of people [m].
 HEIGHTS = 1.3, 2.2
 # Frames that are needed, and a median error [shares of the image] beyond which the figure does not fit the person.
 LEAST, ASTRAY = 10, 0.03
 # Feet of who is filmed by a camera that stands still slip less [m/s].
 SLIPPING = 0.12
-
-
-def simulated(figure: figures.Figure, proportions: np.ndarray, manifest: Path) -> Body:
-    """The human of these proportions, each link as near to them as the weights know."""
-    body = figure.of(proportions)
-    known = stored.trained_sizes(text.loads(manifest.read_bytes()))[body.kind]
-    return body.sized(np.clip(body.sizes, *known))
 
 
 def shown(keypoints: Keypoints) -> tuple[int, int]:
@@ -131,15 +120,14 @@ def reconstruct(
     their number.
     """
     figure = figures.figure()
-    body = simulated(figure, lifted.proportions, MANIFEST)
+    body = figure.of(lifted.proportions)
     scene = Scene((body,), dt=DT)
     model: Dynamics
     truth: Dynamics | None = None
     if dynamics == "mujoco":
         model = MujocoDynamics(Truth(scene, ROWS, SUBSTEPS))
     else:
-        simulator = Simulator(*stored.load(MANIFEST, scene)[:2]) if dynamics == "larp" else Simulator.of_physics(scene)
-        model, truth = simulator, MujocoDynamics(Truth(scene, 1, SUBSTEPS))
+        model, truth = Simulator.of_physics(scene), MujocoDynamics(Truth(scene, 1, SUBSTEPS))
     wanted = physical.wanted_of(scene, figure, lifted, film)
     points = physical.Seen(body, figure, lifted.proportions)
     sigma = lift.noise(film, lifted.camera)
@@ -205,7 +193,7 @@ def main(
         person: which of several, in order of appearance from 0; the one who is seen best by default.
         height: of the person (m); where it is not known, it is estimated by a camera whose position is, and taken to be
             1.75 m by any other.
-        dynamics: the planner's model: larp (learned), physics (nothing is learned) or mujoco.
+        dynamics: the planner's model: larp or mujoco.
         preset: how much the plans may cost.
         seed: of the planner's random numbers.
         out: folder for summary.json, pose.npz and pose.bvh (each a reference for tasks.kick), pose.png,
@@ -242,7 +230,7 @@ def main(
         repr(physical.PRESETS[preset]),
         seed,
     )
-    kept = Kept(out / "unfinished.npz", fingerprint(*given, MANIFEST.read_bytes()))
+    kept = Kept(out / "unfinished.npz", fingerprint(*given))
     if kept.lifted is None:
         with tell.part(f"laying a figure over {len(film)} frames"):
             lifted = lift.lift(film, lens, known, height)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from larp_model.anatomy import KINDS, Detail
+from larp_model.anatomy import KINDS
 from larp_model.bodies import chain, detail_of, human_and_ball, human_and_capsule, two_balls, two_chains
 from larp_model.designs import DesignName, SizeName
 from larp_model.errors import InputError
@@ -21,10 +21,6 @@ from tasks.motions.generator import any_episodes
 from tasks.thrown import thrown_episodes
 
 CHAIN_WINDOWS = (10, 40, 80, 190)
-# The scenarios, and the weights, of humans of every size in any motion.
-ANY_HUMAN: dict[Detail, str] = {"lean": "any_human", "full": "full_human"}
-# The same of the lean human with nothing to strike.
-ANY_HUMAN_ALONE = "any_human_alone"
 
 
 @dataclass(frozen=True)
@@ -32,15 +28,13 @@ class Scenario:
     """A scene, how its truth is drawn, and what the paper reaches there.
 
     draw: episodes from (count, seed), and how many more diverged. windows: the first n steps over which errors are
-    averaged. strikes: a human meets what lies there; `data.contact_episodes` are worth drawing besides. paper: mean
-    position error [m] over the windows, by body.
+    averaged. paper: mean position error [m] over the windows, by body.
     """
 
     name: str
     scene: Scene
     draw: Callable[[int, int], tuple[Episodes, int]]
     windows: tuple[int, ...]
-    strikes: bool = False
     paper: tuple[tuple[str, tuple[float, ...]], ...] = ()
 
 
@@ -62,11 +56,11 @@ def _any_human(scene: Scene, count: int, seed: int) -> tuple[Episodes, int]:
 
 
 def _human(name: str, scene: Scene, *paper: tuple[str, tuple[float, ...]]) -> Scenario:
-    return Scenario(name, scene, partial(_around_the_kick, scene), WINDOWS, bool(scene.between.pairs), paper)
+    return Scenario(name, scene, partial(_around_the_kick, scene), WINDOWS, paper)
 
 
 def _any(name: str, scene: Scene) -> Scenario:
-    return Scenario(name, scene, partial(_any_human, scene), WINDOWS, bool(scene.between.pairs))
+    return Scenario(name, scene, partial(_any_human, scene), WINDOWS)
 
 
 def _thrown(name: str, scene: Scene, *paper: float, varied: bool = True) -> Scenario:
@@ -83,9 +77,9 @@ SCENARIOS = {
             "human_capsule", human_and_capsule(), ("human", (0.010, 0.031, 0.050)), ("capsule", (0.010, 0.042, 0.069))
         ),
         _human("human", human_and_ball().only("human")),
-        _any(ANY_HUMAN["lean"], human_and_ball(self_contact=True)),
-        _any(ANY_HUMAN_ALONE, human_and_ball().only("human")),
-        _any(ANY_HUMAN["full"], human_and_ball(detail="full", self_contact=True)),
+        _any("any_human", human_and_ball(self_contact=True)),
+        _any("any_human_alone", human_and_ball().only("human")),
+        _any("full_human", human_and_ball(detail="full", self_contact=True)),
         _thrown("chain4", Scene((chain(links=4),))),
         _thrown("chains1", two_chains(1), 0.008, 0.021, 0.048, 0.173),
         _thrown("chains2", two_chains(2), 0.007, 0.023, 0.047, 0.137),

@@ -37,7 +37,7 @@ from mpc import CostTerm, Dynamics, Optimizer, Planner, Verified, quadratic
 from mpc.loop import Execution, Phase, Replan, Window, World, execute
 from tasks import residuals
 from tasks.data import stray
-from tasks.models import FLIGHT, DynamicsName, Models, models_of, shipped
+from tasks.models import FLIGHT, NO_WEIGHTS, DynamicsName, Models, models_of
 from tasks.motions import references
 from tasks.motions.bvh import names_in
 from tasks.motions.references import Reference
@@ -60,7 +60,7 @@ AFTER_CONTACT = 200
 # Steps between the plans that keep the human up, until so many after the strike, and from then on.
 CATCH_EVERY, CATCH, STAND_EVERY = 4, 70, 12
 REACHABLE = 0.25
-# Of the human whom the shipped weights know best [m, kg].
+# Of the usual human [m, kg].
 HEIGHT, MASS = 1.75, 70.0
 
 
@@ -83,10 +83,10 @@ class Task(ABC):
     ) -> None:
         """scene: its first body is the human, its last the ball. substeps: engine steps of the truth in a step.
 
-        weights: manifest of the learned model's; those of any human by default.
+        weights: manifest of the model's; nothing is learned by default.
         """
         self.scene, self.reference, self.substeps = scene, reference, substeps
-        self.weights = weights or shipped(scene, embedded=False)
+        self.weights = weights
         self.human = scene.rows(scene.bodies[0].name)
         self.ball = len(scene.links) - 1
         self.foot = scene.index(scene.bodies[0].name, "right_foot")
@@ -94,8 +94,8 @@ class Task(ABC):
         self.standing = standing_height(scene.bodies[0])
         bounds = np.array([(motor.lower, motor.upper) for motor in scene.motors])
         self.lower, self.upper = bounds[:, 0], bounds[:, 1]
-        self._planners: dict[tuple[str | Preset, str | int, Path], tuple[Planners, str]] = {}
-        self._models: dict[tuple[str | int, Path], Models] = {}
+        self._planners: dict[tuple[str | Preset, str | int, Path | None], tuple[Planners, str]] = {}
+        self._models: dict[tuple[str | int, Path | None], Models] = {}
         self._bases: dict[int, tuple[Models, Planner, Planner]] = {}  # by the model, with which they are kept
 
     def __getstate__(self) -> dict[str, Any]:
@@ -136,7 +136,7 @@ class Task(ABC):
         if names is not None and not isinstance(reference, str | Path):
             raise InputError(f"names is {str(names)!r}, but there is no file whose joints they could be")
         if reference is None:
-            return cls(scene, references.embedded(scene), substeps, shipped(scene, embedded=True))
+            return cls(scene, references.embedded(scene), substeps)
         if isinstance(reference, Reference):
             return cls(scene, reference, substeps)
         called = None if names is None else names_in(Path(names))
@@ -233,9 +233,9 @@ class Task(ABC):
         """
         first: tuple[Optimizer, ...] = preset.first
         again: tuple[Optimizer, ...] = preset.again
-        if any(preset.verify) and models.learned:
+        if any(preset.verify) and not models.exact:
             rows = max(2, preset.candidates)  # the plan carried on is tried beside the first proposal
-            truth = models_of(self.scene, "mujoco", Path(), substeps=self.substeps, rows=rows).whole
+            truth = models_of(self.scene, "mujoco", substeps=self.substeps, rows=rows).whole
             enough = (("target", preset.enough),)
             first, again = (
                 (*proposing, Verified(truth, preset.correct, rounds, preset.candidates, enough))
@@ -277,8 +277,8 @@ class Task(ABC):
             if isinstance(dynamics, str):
                 self._models[key] = models_of(self.scene, dynamics, manifest)
             else:
-                learned = models_of(self.scene, "larp", manifest)
-                self._models[key] = learned._replace(whole=dynamics, weights="none")
+                ours = models_of(self.scene, "larp", manifest)
+                self._models[key] = ours._replace(whole=dynamics, weights=NO_WEIGHTS)
         return self._models[key]
 
     def within(self, preset: Preset, budget: float, models: Models, goal: Any) -> Preset:
@@ -313,8 +313,8 @@ class Task(ABC):
         """Plan for a goal and execute in MuJoCo, or in a world of your own.
 
         goal: of a kick, the target (3,) [m]. preset: its name, or one of your own. dynamics: the planner's model, by
-        name or your own of the whole scene; what keeps the human up afterwards has the learned one. weights: manifest
-        of the learned model's; the shipped ones by default. seed: of the planner's random numbers. state: (L, 13) to
+        name or your own of the whole scene; what keeps the human up afterwards has ours. weights: manifest of the
+        model's; the task's own by default. seed: of the planner's random numbers. state: (L, 13) to
         begin in; see `start`. observe: called after every step. Of later runs with the same preset, dynamics and
         weights nothing is compiled again.
         """

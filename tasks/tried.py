@@ -1,11 +1,10 @@
-"""What the planner tries on the way to kicks, with the truth as its model: the strikes that weights must know well."""
+"""What the planner tries on the way to kicks, with the truth as its model: motions that weights must know well."""
 
 from __future__ import annotations
 
 import math
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -47,7 +46,7 @@ def tried_episodes(kick: Kick, kicks: int, each: int, seed: int, seconds: float 
     seconds: after which no other kick is begun.
     """
     random, began = np.random.default_rng(seed), time.perf_counter()
-    whole = models_of(kick.scene, "mujoco", Path(), SUBSTEPS).whole
+    whole = models_of(kick.scene, "mujoco", substeps=SUBSTEPS).whole
     assert isinstance(whole, Continued) and isinstance(whole.dynamics, MujocoDynamics)
     watched = Watched(whole.dynamics.truth)
     planner = kick.planner(replace(whole, dynamics=MujocoDynamics(watched)), (STEPS,))

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from larp_model import designs
 from larp_model.bodies import human_and_ball
-from larp_model.networks import Weights
-from larp_model.parts.part import Model
+from larp_model.learned.model import Model
+from larp_model.learned.paper import PaperModel, Sizes
+from larp_model.learned.residual import ResidualModel
+from larp_model.networks import Size, Weights
 from larp_model.runtime import remember_compilations
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from larp_model.training import Recipe, Windows, statistics_of
 from larp_model.truth.episodes import Episodes
-from larp_model.weights import untrained
 from tasks.data import random_episodes
 from tasks.motions.references import Reference, embedded
 
@@ -69,16 +69,19 @@ def episodes(scene: Scene, reference: Reference) -> Episodes:
     return random_episodes(scene, reference, count=64, seed=0, steps=30)[0]
 
 
+LEAST = Size(2, 16)
+
+
 @pytest.fixture(scope="session")
-def compact(scene: Scene) -> Model:
-    """The shipped kind of model, as small as it can be."""
-    return designs.compact(scene, designs.LEAST)
+def residual(scene: Scene) -> Model:
+    """The kind of model that ships, with networks as small as they can be."""
+    return ResidualModel(scene, LEAST)
 
 
 @pytest.fixture(scope="session")
 def paper(scene: Scene) -> Model:
     """The paper's kind of model, as small as it can be."""
-    return designs.paper(scene, designs.LEAST)
+    return PaperModel(scene, Sizes(LEAST, LEAST, LEAST))
 
 
 def random_weights(model: Model, episodes: Episodes) -> Weights:
@@ -89,9 +92,9 @@ def random_weights(model: Model, episodes: Episodes) -> Weights:
 
 
 @pytest.fixture(scope="session")
-def compact_weights(compact: Model, episodes: Episodes) -> Weights:
-    """Random weights of `compact`."""
-    return random_weights(compact, episodes)
+def residual_weights(residual: Model, episodes: Episodes) -> Weights:
+    """Random weights of `residual`."""
+    return random_weights(residual, episodes)
 
 
 @pytest.fixture(scope="session")
@@ -101,7 +104,6 @@ def paper_weights(paper: Model, episodes: Episodes) -> Weights:
 
 
 @pytest.fixture(scope="session")
-def mechanical(scene: Scene) -> Simulator:
-    """The kick's scene by mechanics alone: the hybrid design, of which nothing is learned."""
-    model = designs.hybrid(scene, designs.LEAST)
-    return Simulator(model, untrained(model))
+def physics(scene: Scene) -> Simulator:
+    """The kick's scene by physics alone."""
+    return Simulator.of_physics(scene)

@@ -1,4 +1,4 @@
-"""Fitting weights to a motion and a body: what is promised of the better of both, of training time, of bad input."""
+"""Fitting a network to a motion and a body: what is promised of the better of both, of training time, of bad input."""
 
 import json
 import math
@@ -8,29 +8,16 @@ import jax
 import numpy as np
 import pytest
 
-from larp_model import designs, training
+from larp_model import training
 from larp_model import weights as stored
 from larp_model.bodies import human_and_ball
 from larp_model.errors import InputError
+from larp_model.learned.model import Model
+from larp_model.networks import Weights
 from tasks import adapt
 from tasks.adapt import Checked
 from tasks.data import random_episodes
 from tasks.kick import Kick
-from tasks.scenarios import ANY_HUMAN
-from tasks.train import OVER_MECHANICS
-
-SCENE = human_and_ball()
-
-
-@pytest.fixture(scope="module")
-def manifest(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Weights of the least networks, hardly trained."""
-    folder = tmp_path_factory.mktemp("weights")
-    model = designs.compact(SCENE, designs.LEAST)  # compiles sooner than one over mechanics
-    episodes, _ = random_episodes(SCENE, Kick.standard().reference, 64, 3)
-    windows = training.Windows(SCENE, [(episodes, 1.0)], OVER_MECHANICS)
-    weights = training.statistics_of(model, windows, np.random.default_rng(0), batches=1)
-    return stored.save(folder, ANY_HUMAN["lean"], model, weights, {})
 
 
 def test_smaller_errors_are_better_and_the_same_are_not() -> None:
@@ -48,39 +35,33 @@ def test_smaller_errors_are_better_and_the_same_are_not() -> None:
         ({"minutes": math.nan}, "minutes is nan, but must be at least 2"),
         ({"reference": Path("nowhere.bvh")}, "reference is 'nowhere.bvh', but no such file exists"),
         ({"height": -1.0}, "height is -1.0, but must be a positive finite number"),
-        ({"weights": Path("nowhere.json")}, "weights is 'nowhere.json', but no such file exists"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_drawn(
-    given: dict[str, object], complaint: str, manifest: Path, tmp_path: Path
+    given: dict[str, object], complaint: str, tmp_path: Path
 ) -> None:
     with pytest.raises(InputError, match=complaint):
-        adapt.main(**({"weights": manifest, "out": tmp_path / "out"} | given))  # type: ignore[arg-type]
+        adapt.main(**({"out": tmp_path / "out"} | given))  # type: ignore[arg-type]
     assert not list((tmp_path / "out").glob("*.json"))
 
 
-def test_adapting_says_that_it_extrapolates_and_writes_the_better_of_both(
-    manifest: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_adapting_writes_the_better_of_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in (("LEAST", 0.0), ("HELD_OUT", 8), ("DRAWN", 24), ("MOST", 24), ("CHECKING", 5.0), ("KICKS", 1)):
         monkeypatch.setattr(adapt, name, value)
-    adapt.main(height=1.6, mass=50.0, minutes=1.0, weights=manifest, out=tmp_path)
-    said = capsys.readouterr().out
+    adapt.main(height=1.6, mass=50.0, minutes=1.0, size="tiny", out=tmp_path)
     content = json.loads((tmp_path / "adapted.json").read_text())["recipe"]
-    assert "beyond what the weights know: human." in said
     before, after = (Checked(tuple(content[name]["human"]), content[name]["launch"]) for name in ("before", "after"))
     assert content["kept"] == ("after" if after.better_than(before) else "before")
-    stored.load(tmp_path / "adapted.json", human_and_ball(height=1.6, mass=50.0))
-    stored.load(tmp_path / "adapted.json", SCENE)
+    model, _, _ = stored.load(tmp_path / "adapted.json", human_and_ball(height=1.6, mass=50.0))
+    assert bool(model.networks()) == (content["kept"] == "after")
 
 
-def test_training_for_a_time_takes_that_time(manifest: Path, tmp_path: Path) -> None:
-    model, weights, _ = stored.load(manifest, SCENE)
-    episodes, _ = random_episodes(SCENE, Kick.standard().reference, 16, 4, steps=12)
+def test_training_for_a_time_takes_that_time(residual: Model, residual_weights: Weights, tmp_path: Path) -> None:
+    episodes, _ = random_episodes(residual.scene, Kick.standard().reference, 16, 4, steps=12)
     recipe = training.Recipe(100_000, 16, ((1, 1.0),))
-    learned, log = training.train(model, recipe, [(episodes, 1.0)], tmp_path, weights, quiet=True, seconds=8.0)
-    assert log["seconds"] < 60.0 and training.TIMED < log["history"][-1]["update"] < 100_000
-    moved = jax.tree.map(lambda a, b: bool((a != b).any()), learned.networks, weights.networks)
+    learned, log = training.train(residual, recipe, [(episodes, 1.0)], tmp_path, residual_weights, True, 8.0)
+    assert log["seconds"] < 90.0 and training.TIMED < log["history"][-1]["update"] < 100_000
+    moved = jax.tree.map(lambda a, b: bool((a != b).any()), learned.networks, residual_weights.networks)
     assert any(jax.tree.leaves(moved))
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 import larp_model
-from larp_model import Simulator, commands, human
+from larp_model import commands, human
 from larp_model.errors import InputError
 from larp_model.files import write_whole, written_whole
 from larp_model.names import require_file
@@ -51,7 +51,6 @@ def test_a_mistyped_name_is_answered_with_the_nearest(tmp_path: Path) -> None:
     for mistyped, meant in (
         (lambda: preset_of("balancd"), "balanced"),
         (lambda: scenario("any_humn"), "any_human"),
-        (lambda: Simulator.load("human_bal"), "human_ball"),
         (lambda: human(lengths={"thig": 1.1}), "thigh"),
         (lambda: require_file("reference", tmp_path / "kik.bvh"), "kick.bvh"),
     ):

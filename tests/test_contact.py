@@ -1,4 +1,4 @@
-"""Contact: closest points of capsules, conservative advancement, and the free impact, with their gradients."""
+"""Contact: closest points of capsules and conservative advancement, with their gradients."""
 
 from __future__ import annotations
 
@@ -14,19 +14,16 @@ from hypothesis import strategies as st
 from jax import Array
 from jax.test_util import check_grads
 from mujoco.mjx._src.collision_primitive import capsule_capsule
-from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from larp_model import contact
 from larp_model import state as packed
-from larp_model.bodies import BALL_SURFACE
 from larp_model.contact import Closest, Segment
 from larp_model.kinematics import morphology_of
-from larp_model.meeting import Meeting, gatherings, meetings, within_reach
-from larp_model.scene import Scene, Surface, Vector
+from larp_model.meeting import Meeting, meetings
+from larp_model.scene import Scene, Vector
 
 closest = jax.jit(contact.closest)
-impact = jax.jit(contact.impact, static_argnames="surface")
 
 
 @pytest.fixture(autouse=True)
@@ -260,133 +257,3 @@ def test_a_foot_that_crosses_the_ball_within_a_step_is_seen(scene: Scene) -> Non
     np.testing.assert_allclose(fast.normal[0, struck], [0.0, 1.0, 0.0], atol=1e-6)
     np.testing.assert_allclose(fast.remaining[0, struck], scene.dt - gap / 16.0, atol=1e-5)
     assert float(slow.remaining[0, struck]) == 0.0 < float(faster.remaining[0, struck])
-
-
-def test_links_out_of_reach_do_not_feel_each_other(scene: Scene) -> None:
-    random, count = np.random.default_rng(9), 400
-    state = np.zeros((count, len(scene.links), packed.SIZE))
-    state[..., packed.POSITION] = random.uniform((-0.5, -0.5, 0.5), (0.5, 0.5, 1.5), (*state.shape[:2], 3))
-    state[..., packed.ORIENTATION] = (
-        Rotation.random(state[..., 0].size, rng=random).as_quat().reshape(*state.shape[:2], 4)
-    )
-    free = state.copy()
-    for each in (state, free):
-        speed = random.uniform(0.0, 30.0, (count, 1, 1))
-        each[..., packed.VELOCITY] = speed * random.standard_normal((*state.shape[:2], 3))
-        each[..., packed.ANGULAR_VELOCITY] = 3.0 * speed * random.standard_normal((*state.shape[:2], 3))
-    shape = morphology_of(scene)[None]
-
-    def reach(one: Array, after: Array) -> Array:
-        [(_, first, second)] = gatherings(scene, one, shape, after)
-        return within_reach(first, second, scene.dt)
-
-    within = np.asarray(jax.jit(reach)(jnp.asarray(state), jnp.asarray(free)))
-    [(_, touch)] = meetings(scene, jnp.asarray(state), shape, jnp.asarray(free))
-    felt = np.asarray(touch.near) > 0.0
-    assert felt.any() and (~within).any()
-    assert not (felt & ~within).any()
-
-
-def integrated(
-    acceleration: float, surface: Surface, depth: float, approach: float, time: float
-) -> tuple[float, float]:
-    """Gap [m] and its speed [m/s] after `time` by numerical integration of the equation in `contact.impact`."""
-    share = contact.IMPEDANCE
-
-    def motion(_: float, state: np.ndarray) -> list[float]:
-        spring = surface.stiffness * state[0] + surface.damping * state[1]
-        return [state[1], (1.0 - share) * acceleration - share * spring]
-
-    def release(_: float, state: np.ndarray) -> float:
-        return float(state[0])
-
-    release.terminal, release.direction = True, -1.0  # type: ignore[attr-defined]
-    found = solve_ivp(motion, (0.0, time), [depth, approach], events=release, rtol=1e-9, atol=1e-12, max_step=1e-4)
-    free, (end_depth, end_rate) = time - found.t[-1], found.y[:, -1]
-    return -end_depth - end_rate * free - 0.5 * acceleration * free**2, -end_rate - acceleration * free
-
-
-SOFT = Surface.bouncing(contact_time=0.02, restitution=0.5, friction=0.5)
-
-
-@pytest.mark.parametrize("surface", [BALL_SURFACE, SOFT], ids=["ball", "soft"])
-@pytest.mark.parametrize("acceleration", [0.0, 9.81])
-def test_impact_solves_its_equation_through_release(surface: Surface, acceleration: float) -> None:
-    random = np.random.default_rng(9)
-    depth = np.where(random.random(40) < 0.5, 0.0, random.uniform(0.0, 0.02, 40))
-    approach, time = random.uniform(0.5, 15.0, 40), random.uniform(0.0, 0.01, 40)
-    approach[depth > 0.0] -= 8.0  # some are already on their way out
-    found = impact(jnp.asarray(depth), jnp.asarray(approach), acceleration, surface, jnp.asarray(time))
-    rows = zip(depth, approach, time, strict=True)
-    gap, speed = np.array([integrated(acceleration, surface, *row) for row in rows]).T
-    np.testing.assert_allclose(found.gap, gap, atol=2e-6)
-    change = speed + approach + acceleration * time
-    np.testing.assert_allclose(found.change, np.maximum(change, 0.0), atol=2e-3)  # a contact never pulls
-    travel = gap + depth + approach * time + 0.5 * acceleration * time**2
-    pushed = change > 1e-3
-    np.testing.assert_allclose((found.change * found.lag)[pushed], travel[pushed], atol=1e-5)
-
-
-@pytest.mark.parametrize("restitution", [0.3, 0.6, 0.86, 1.0])
-@pytest.mark.parametrize("contact_time", [0.002, 0.010, 0.030])
-def test_a_surface_returns_its_restitution_within_its_contact_time(restitution: float, contact_time: float) -> None:
-    surface = Surface.bouncing(contact_time, restitution, friction=0.5)
-    for approach in (0.5, 10.0):
-        found = impact(0.0, approach, 0.0, surface, 1.02 * contact_time)
-        assert float(found.change) == pytest.approx((1.0 + restitution) * approach, rel=0.01)
-        assert float(found.gap) > 0.0
-        assert float(impact(0.0, approach, 0.0, surface, 0.98 * contact_time).gap) < 0.0
-
-
-@pytest.mark.parametrize("share", [0.2, 0.6, 0.98, 1.0, 1.02, 1.5, 1.8])
-def test_what_nearly_rests_stays_near_rest(share: float) -> None:
-    sunk = (1.0 - contact.IMPEDANCE) * 9.81 / (contact.IMPEDANCE * BALL_SURFACE.stiffness)
-    for time in (0.002, 0.01, 0.02):
-        found = impact(share * sunk, 0.0, 9.81, BALL_SURFACE, time)
-        assert float(found.change) == pytest.approx(9.81 * time, abs=1e-3)
-        assert abs(-float(found.gap) - sunk) <= abs(share - 1.0) * sunk + 1e-9
-
-
-@given(st.floats(0.0, 0.03), st.floats(-15.0, 15.0), st.floats(0.0, 0.01))
-def test_an_impact_never_adds_energy(depth: float, approach: float, time: float) -> None:
-    found = impact(depth, approach, 0.0, BALL_SURFACE, time)
-    speed, spring = float(found.change) - approach, contact.IMPEDANCE * BALL_SURFACE.stiffness
-    before = 0.5 * approach**2 + 0.5 * spring * depth**2
-    after = 0.5 * speed**2 + 0.5 * spring * max(-float(found.gap), 0.0) ** 2
-    assert after <= before + 1e-9
-    assert float(found.change) >= 0.0 and 0.0 <= float(found.lag) <= time
-
-
-@pytest.mark.parametrize("speed", [0.1, 1.0, 10.0])
-def test_what_parts_is_free(speed: float) -> None:
-    assert float(impact(0.0, -speed, 0.0, BALL_SURFACE, 0.01).gap) == pytest.approx(speed * 0.01)
-    for acceleration in (0.0, 9.81):
-        assert float(impact(0.0, -speed, acceleration, BALL_SURFACE, 0.01).change) == pytest.approx(0.0, abs=1e-9)
-
-
-@pytest.mark.parametrize("precise", [True, False], ids=["double", "single"])
-def test_gradients_of_an_impact_are_finite_everywhere(precise: bool) -> None:
-    with jax.enable_x64(precise):
-        grid = jnp.meshgrid(
-            jnp.array([0.0, 1e-6, 1e-3, 0.03]),
-            jnp.array([-10.0, -1e-6, 0.0, 1e-6, 1.0, 15.0]),
-            jnp.array([0.0, 9.81]),
-            jnp.array([0.0, 1e-6, 0.01]),
-        )
-
-        def flat(depth: Array, approach: Array, acceleration: Array, time: Array) -> Array:
-            return jnp.stack(contact.impact(depth, approach, acceleration, BALL_SURFACE, time))
-
-        for derivative in (jax.jacfwd, jax.jacrev):
-            found = jax.jit(jax.vmap(derivative(flat, argnums=(0, 1, 2, 3))))(*(axis.reshape(-1) for axis in grid))
-            assert all(np.isfinite(part).all() for part in found)
-
-
-def test_forward_reverse_and_finite_differences_of_an_impact_agree() -> None:
-    depth, approach = jnp.array([0.0, 0.004, 0.001, 0.02]), jnp.array([8.0, -1.0, 12.0, 0.3])
-    time = jnp.array([0.005, 0.003, 0.01, 0.01])
-
-    def found(depth: Array, approach: Array, acceleration: Array, time: Array) -> contact.Impact:
-        return contact.impact(depth, approach, acceleration, BALL_SURFACE, time)
-
-    check_grads(jax.jit(found), (depth + 1e-5, approach, jnp.full(4, 9.81), time), 1, ("fwd", "rev"), 1e-4, 1e-4, 1e-7)

@@ -15,14 +15,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
-from larp_model import weights as stored
 from larp_model.bodies import human_and_ball, standing_height
 from larp_model.errors import InputError
 from mpc import CEM
 from tasks import kick
 from tasks.command import Teller, run
 from tasks.data import random_task
-from tasks.models import WEIGHTS, models_of, shipped
+from tasks.models import models_of
 from tasks.motions import references
 from tasks.presets import PRESETS, Preset, preset_of
 
@@ -75,23 +74,8 @@ def test_the_standing_height_is_that_of_the_closed_up_rest_pose() -> None:
     assert state[0, 2] == pytest.approx(standing_height(scene.bodies[0]), abs=1e-9)
 
 
-def test_the_weights_of_the_embedded_kick_are_used_for_it_alone() -> None:
-    usual = human_and_ball()
-    assert shipped(usual, embedded=True).name == "human_ball.json"
-    for scene, embedded in (
-        (usual, False),
-        (human_and_ball(height=1.6), True),
-        (human_and_ball(self_contact=True), True),
-    ):
-        assert shipped(scene, embedded).name == "any_human.json"
-    for scene in (usual, human_and_ball(height=1.6, mass=50.0), human_and_ball(self_contact=True)):
-        stored.load(shipped(scene, embedded=True), scene)
-
-
-def test_the_full_human_has_weights_of_its_own_and_may_touch_the_ball_with_its_toes() -> None:
-    scene = human_and_ball(detail="full")
-    assert shipped(scene, embedded=True) == shipped(scene, embedded=False) == stored.SHIPPED / "full_human.json"
-    (pair,) = scene.pairs
+def test_the_full_human_may_touch_the_ball_with_its_toes() -> None:
+    (pair,) = human_and_ball(detail="full").pairs
     assert {"left_toes", "right_toes"} < set(pair.first_links)
 
 
@@ -111,8 +95,8 @@ def test_tasks_are_drawn_within_the_protocols_bounds() -> None:
         assert (np.abs(shift) <= 0.03).all()
 
 
-def test_with_the_shipped_weights_fast_hits_its_targets_and_stays_near_the_reference(task: kick.Kick) -> None:
-    models = models_of(task.scene, "larp", stored.SHIPPED / f"{WEIGHTS}.json")
+def test_fast_hits_its_targets_and_stays_near_the_reference(task: kick.Kick) -> None:
+    models = models_of(task.scene, "larp")
     planners, random, reports = task.planners_of(preset_of("fast"), models), np.random.default_rng(5), []
     for seed in range(3):
         target, shift = random_task(random)
@@ -124,7 +108,7 @@ def test_with_the_shipped_weights_fast_hits_its_targets_and_stays_near_the_refer
 
 
 def test_with_the_truth_as_model_what_is_predicted_happens(task: kick.Kick, small: None) -> None:
-    models = models_of(task.scene, "mujoco", stored.SHIPPED, substeps=task.substeps)
+    models = models_of(task.scene, "mujoco", substeps=task.substeps)
     planners = task.planners_of(preset_of("fast"), models)
     target = np.array([3.0, 0.2, 0.4])
     execution = task.run(planners._replace(every=100), target, seed=0, stands=False)
@@ -135,7 +119,7 @@ def test_with_the_truth_as_model_what_is_predicted_happens(task: kick.Kick, smal
 
 def test_the_limit_is_the_miss_of_the_same_controls_at_the_finer_step(small: None) -> None:
     coarse = kick.Kick.standard(substeps=4)
-    models = models_of(coarse.scene, "mujoco", stored.SHIPPED, substeps=4)
+    models = models_of(coarse.scene, "mujoco", substeps=4)
     target = np.array([3.0, 0.2, 0.4])
     planners = coarse.planners_of(preset_of("fast"), models)
     execution = coarse.run(planners, target, seed=0, stands=False)
@@ -215,7 +199,7 @@ def test_a_ball_that_is_moved_by_no_vector_is_refused_by_name(task: kick.Kick) -
 
 
 def test_a_target_out_of_reach_is_marked_and_still_gets_a_plan(task: kick.Kick, small: None) -> None:
-    models = models_of(task.scene, "larp", stored.SHIPPED / f"{WEIGHTS}.json")
+    models = models_of(task.scene, "larp")
     planners = task.planners_of(preset_of("fast"), models)
     target = np.array([0.0, 0.0, 40.0])
     report = task.report(task.run(planners, target, seed=0), target)

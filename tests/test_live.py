@@ -42,7 +42,7 @@ def page(kick: Kick) -> Iterator[LivePage]:
 def test_what_is_wished_for_at_first_is_what_is_usual(page: LivePage, kick: Kick) -> None:
     wishes = page.wishes
     assert wishes.target == (4.0, 0.0, 0.5) and wishes.spot == wishes.roll == (0.0, 0.0)
-    assert (wishes.preset, wishes.dynamics, wishes.weights) == (next(iter(PRESETS)), "larp", "human_ball")
+    assert (wishes.preset, wishes.dynamics, wishes.weights) == (next(iter(PRESETS)), "larp", "none")
     assert dict(wishes.terms) == {term.name: term.weight for term in kick.terms}
     np.testing.assert_array_equal(wished(kick, wishes), kick.start())
 
@@ -107,8 +107,9 @@ def test_a_push_changes_the_velocity_of_its_body_alone(kick: Kick) -> None:
     assert abs(apart[:-1]).max() < 1e-6 and not pushed.waiting
 
 
-def test_weights_of_other_scenes_are_not_offered(kick: Kick) -> None:
-    assert list(weights_for(kick, None)) == ["human_ball", "any_human"]
+def test_weights_that_are_chosen_come_first_and_none_can_be_had(kick: Kick) -> None:
+    assert weights_for(kick, None) == {"none": None}
+    assert list(weights_for(kick, Path("runs/adapt/adapted.json"))) == ["adapted", "none"]
 
 
 def test_a_kept_kick_of_another_scene_or_damaged_is_refused(kick: Kick, tmp_path: Path) -> None:

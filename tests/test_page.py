@@ -17,7 +17,6 @@ import pytest
 import viser
 from matplotlib.image import imread
 
-from larp_model import weights as stored
 from mpc import CEM
 from tasks.kick import Kick, wished
 from tasks.live import Choices, Live
@@ -67,7 +66,7 @@ def planned_for(served: Served) -> Wishes:
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     task = Kick.standard(substeps=4)
     tasks = {"embedded": lambda: task, "another": lambda: Kick.standard(substeps=4)}
-    weights = {"usual": task.weights, "any human": stored.SHIPPED / "any_human.json"}
+    weights = {"none": None, "others": Path("others.json")}
     choices = Choices(tasks, {"quick": QUICK, "other": OTHER}, ("mujoco", "larp"), weights)
     with LivePage(port=0, offer=choices.offer(task)) as page:
         live = Live(page, choices, TARGET, tmp_path_factory.mktemp("kept"), start=wished)
@@ -249,7 +248,7 @@ def test_the_ball_is_dragged_to_where_it_lies_and_by_how_it_rolls(
     [
         ("Preset", "preset", "other"),
         ("Model", "dynamics", "larp"),
-        ("Its weights", "weights", "any human"),
+        ("Its weights", "weights", "others"),
         ("Reference", "reference", "another"),
     ],
     ids=["preset", "model", "weights", "reference"],

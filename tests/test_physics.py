@@ -6,19 +6,25 @@ from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from jax import Array
 
 from larp_model import launches
 from larp_model import state as packed
-from larp_model.bodies import ball, two_balls
+from larp_model.bodies import BALL_SURFACE, ball, capsule, chain, human, two_balls
+from larp_model.learned.residual import ResidualModel
+from larp_model.mechanics import Momenta, articulated_motion
+from larp_model.networks import Weights
 from larp_model.physics import contact
 from larp_model.physics import step as physics
-from larp_model.scene import Scene
+from larp_model.physics.collision import ContactSettings
+from larp_model.physics.response import Gains, responses
+from larp_model.scene import Body, Pair, Scene
 from larp_model.simulator import Simulator
 from larp_model.simulator import step as simulator_step
-from larp_model.truth.mujoco import Truth
+from larp_model.truth.mujoco import Truth, closed, compile_model
 from tasks.data import random_episodes
 from tasks.motions.references import Reference
 
@@ -131,6 +137,44 @@ def test_a_ball_bounces_slides_and_rolls_as_mujocos_does() -> None:
     np.testing.assert_allclose(spin, known, atol=0.3)
 
 
+@pytest.mark.parametrize("body", [capsule(), chain(links=4), human()], ids=["capsule", "chain", "human"])
+def test_impulses_are_answered_at_once_as_the_engines_inertia_says(body: Body, in_64_bits: None) -> None:
+    scene, links, count = Scene((body,)), len(body.links), 6
+    random = np.random.default_rng(5)
+    states, push = np.zeros((count, links, packed.SIZE)), random.standard_normal((count, links, 6))
+    turned = random.standard_normal((count, 1, 4)) + 0.2 * random.standard_normal((count, links, 4))
+    states[..., packed.ORIENTATION] = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
+    states[..., 2] = 10.0
+    states = closed(scene, states)
+    model, truth = compile_model(scene), Truth(scene, count)
+    truth.reset(states)
+
+    @jax.jit
+    def gained(states: Array, push: Array) -> Gains:
+        state, pushes = (jnp.moveaxis(each, 0, -1) for each in (states, push))
+        sizes = jnp.broadcast_to(jnp.asarray(scene.morphology)[..., None], (links, 3, count))
+        targets, still = jnp.zeros((len(body.motors), 3, count)), jnp.zeros((links, 3, count))
+        _, articulation = articulated_motion(body, state, targets, still, sizes, 0.0, 1e-9)
+        momenta = Momenta(*(each[:, :, None] for each in (pushes[:, 3:], pushes[:, :3])))
+        kept, fading = responses(body, articulation, momenta, sizes, 0.003)
+        return Gains(*(jnp.moveaxis(a + b, -1, 0)[..., 0] for a, b in zip(kept, fading, strict=True)))
+
+    found = gained(jnp.asarray(states), jnp.asarray(push))
+    data, inertia = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    for index in range(count):
+        data.qpos[:] = truth.coordinates()[0][index]
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, inertia)
+        jacobians = np.zeros((links, 6, model.nv))
+        for link, jacobian in zip(body.links, jacobians, strict=True):
+            row = model.body(f"{body.name}/{link.name}").id
+            mujoco.mj_jacBody(model, data, jacobian[:3], jacobian[3:], row)
+        expected = jacobians @ np.linalg.solve(inertia, np.einsum("lkv,lk->v", jacobians, push[index]))
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(found.velocity[index], expected[:, :3], atol=1e-5 * scale)
+        np.testing.assert_allclose(found.spin[index], expected[:, 3:], atol=1e-5 * scale)
+
+
 @pytest.fixture(scope="module")
 def meeting_balls() -> np.ndarray:
     """States (6, 2, 13) of two balls far above the ground that soon touch; those of the last row do not."""
@@ -184,19 +228,29 @@ def test_a_scene_moves_alike_alone_and_beside_others(
         np.testing.assert_allclose(together[row], alone, atol=1e-5)
 
 
-def test_balls_that_meet_have_the_gradient_of_their_differences(meeting_balls: np.ndarray, in_64_bits: None) -> None:
-    simulator, start = Simulator.of_physics(two_balls()), jnp.asarray(meeting_balls[:5], jnp.float64)
-    random = np.random.default_rng(3)
-    weigh, along = random.standard_normal(start.shape), random.standard_normal(start.shape)
+def test_a_chain_that_strikes_a_ball_on_the_ground_has_the_gradient_of_its_differences(in_64_bits: None) -> None:
+    pair = Pair("chain", "ball", ("link1",), ("ball",), BALL_SURFACE)
+    scene, random = Scene((chain(links=2), ball()), (pair,)), np.random.default_rng(3)
+    model = ResidualModel(scene, contacts=ContactSettings(iterations=40))
+    states = np.zeros((3, 3, packed.SIZE))
+    states[..., packed.ORIENTATION] = 1.0, 0.0, 0.0, 0.0
+    states[:, 1, 2], states[:, 0, 2] = 0.25, 0.25 + scene.links[0].length + 2.0 * scene.links[0].radius
+    states = closed(scene, states)
+    states[:, 2, packed.POSITION] = (0.0, 0.18, 0.1101)  # where it touches neither the ground nor the chain yet
+    states[:, :2, packed.VELOCITY] = (0.0, 6.0, 0.0)
+    states[:, :2] += 0.05 * random.standard_normal((3, 1, packed.SIZE)) * (np.arange(packed.SIZE) > 6)
+    weigh, along = random.standard_normal((2, *states.shape))
 
-    @jax.jit
-    def value(state: Array) -> Array:
-        return jnp.sum(weigh * simulator.rollout(state, jnp.zeros((5, 3, 0, 3)))[:, -1], axis=(1, 2))
+    def value(state: Array) -> tuple[Array, Array]:
+        after = simulator_step(model, Weights({}, {}, {}), state, jnp.zeros((3, 0, 3)))
+        return jnp.sum(weigh * after), jnp.stack([jnp.sum(weigh * after, axis=(1, 2)), after[:, 2, 8]])
 
-    reverse = jnp.sum(along * jax.jit(jax.grad(lambda state: value(state).sum()))(start), axis=(1, 2))
-    little = 1e-6
-    differences = (value(start + little * along) - value(start - little * along)) / (2.0 * little)
-    np.testing.assert_allclose(reverse, differences, rtol=1e-3, atol=1e-3)
+    soon = {"xla_backend_optimization_level": 0}
+    slope, (_, speed) = jax.jit(jax.grad(value, has_aux=True), compiler_options=soon)(states)
+    assert (speed > 1.0).all(), "the ball is on its way"
+    valued, little = jax.jit(lambda state: value(state)[1][0], compiler_options=soon), 1e-6
+    differences = (valued(states + little * along) - valued(states - little * along)) / (2.0 * little)
+    np.testing.assert_allclose(jnp.sum(along * slope, axis=(1, 2)), differences, rtol=1e-3, atol=1e-3)
 
 
 def test_kicks_are_mujocos_though_nothing_is_learned(scene: Scene, reference: Reference) -> None:

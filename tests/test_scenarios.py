@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +18,10 @@ from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.designs import DesignName
 from larp_model.errors import InputError
+from larp_model.learned.model import initial_weights
+from larp_model.learned.residual import ResidualModel
 from larp_model.meeting import first_contacts
-from larp_model.parts.articulated import Articulated
-from larp_model.parts.paper import PaperBody
-from larp_model.parts.part import BodyPart, initial_weights, measure
+from larp_model.networks import Size, Weights
 from larp_model.training import Windows
 from larp_model.truth.episodes import Episodes
 from tasks import train
@@ -94,11 +94,6 @@ def test_an_unknown_scene_is_refused_by_name() -> None:
         scenario("robot")
 
 
-def test_weights_that_are_not_shipped_are_refused_with_the_way_to_them(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"python -m tasks.train --scene two_balls"):
-        model.main(scene="two_balls", json=tmp_path / "model.json")
-
-
 def test_a_design_that_was_not_trained_is_refused_with_the_way_to_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -117,16 +112,16 @@ def test_other_weights_and_the_second_truth_are_rows_beside() -> None:
     assert "a step of a scene, the paper design" in rows
 
 
-@pytest.mark.parametrize(("design", "part", "stage"), [(None, Articulated, "steps"), ("paper", PaperBody, "rollouts")])
+@pytest.mark.parametrize("design", get_args(DesignName))
 def test_a_scene_becomes_weights_and_scores(
-    design: DesignName | None, part: type[BodyPart], stage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    design: DesignName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(model, "BATCHES", (2,))  # every other size is compiled once more
     train.main(scene="chain4", design=design, folder=tmp_path / "run", episodes=64, effort=1e-4)
     manifest = tmp_path / "run/weights/chain4.json"
     made, _, content = stored.load(manifest, SCENARIOS["chain4"].scene)
-    assert [type(each) for each in made.bodies] == [part]
-    assert [each["stage"] for each in content["recipe"]["rounds"]] == [stage]
+    assert made == designs.design(SCENARIOS["chain4"].scene, design)
+    assert [each["stage"] for each in content["recipe"]["rounds"]] == [stage.name for stage in train.STAGES[design]]
     model.main(scene="chain4", sequences=16, weights=manifest, json=tmp_path / "model.json")
     found = json.loads((tmp_path / "model.json").read_text())
     assert found["windows"].keys() == {"10", "40", "80", "190"}
@@ -136,19 +131,16 @@ def test_a_scene_becomes_weights_and_scores(
     assert (tmp_path / "model.png").stat().st_size > 1000
 
 
-def test_training_that_goes_on_keeps_the_mechanics_that_the_weights_correct(tmp_path: Path) -> None:
-    given, scene = stored.SHIPPED / "chain4.json", SCENARIOS["chain4"].scene
-    before, _, _ = stored.load(given, scene)
-    assert before != designs.hybrid(scene), "or this test could not fail"
-    train.main(scene="chain4", folder=tmp_path, episodes=16, start=given)
-    after, _, _ = stored.load(tmp_path / "weights/chain4.json", scene)
-    assert after == before
+def test_training_goes_on_from_weights_of_the_same_model_alone(tmp_path: Path) -> None:
+    scene = SCENARIOS["chain4"].scene
+    other = stored.save(tmp_path, "chain4", ResidualModel(scene), Weights({}, {}, {}), {"rounds": []})
+    with pytest.raises(InputError, match=r"from is .*, but holds weights of another model"):
+        train.main(scene="chain4", folder=tmp_path / "run", episodes=16, start=other)
 
 
-def test_training_that_goes_on_is_asked_for_no_size(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="size is 'tiny', but the networks of weights to go on from keep their own"):
-        train.main(scene="chain4", size="tiny", folder=tmp_path / "run", start=stored.SHIPPED / "chain4.json")
-    assert not (tmp_path / "run").exists()
+def test_only_residual_networks_come_in_sizes(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="size is 'tiny', but only the residual design comes in sizes"):
+        train.main(scene="chain4", design="paper", size="tiny", folder=tmp_path / "run")
 
 
 def test_other_bodies_than_a_human_are_not_asked_for_another_kick(tmp_path: Path) -> None:
@@ -170,15 +162,15 @@ def test_varied_humans_around_the_kick_are_all_others_and_as_high_above_the_grou
 @pytest.mark.parametrize("name", list(SCENARIOS))
 def test_every_scene_can_be_trained(name: str) -> None:
     """One update with gradients, of every network, down to shapes and types: compiling all of them takes too long."""
-    chosen, stage = SCENARIOS[name], train.stages_of(SCENARIOS[name])[0]
+    chosen, (stage,) = SCENARIOS[name], train.STAGES["residual"]
     episodes, _ = chosen.draw(4, 1)
-    made, recipe = designs.hybrid(chosen.scene, designs.LEAST), replace(stage.recipe, batch=4)
+    made, recipe = ResidualModel(chosen.scene, Size(2, 16)), replace(stage.recipe, batch=4)
     drawn = Windows(chosen.scene, [(episodes, 1.0)], recipe).draw(np.random.default_rng(0), 1)
 
     def update(key: Array) -> Any:
         before, after = jnp.asarray(drawn.states[:, 0]), jnp.asarray(drawn.states[:, 1])
         rest = drawn.controls[:, 0], drawn.torques[:, 0], drawn.morphology
-        weights = initial_weights(made, key, measure(made, before, after, *map(jnp.asarray, rest)))
+        weights = initial_weights(made, key, made.measure(before, after, *map(jnp.asarray, rest)))
         state = training.optimiser(recipe).init(weights.networks)
         return training.update_of(made, recipe, weights)(weights.networks, state, key, drawn, 1e-3)
 

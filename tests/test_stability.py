@@ -14,8 +14,8 @@ import pytest
 from larp_model import state as packed
 from larp_model.bodies import ball
 from larp_model.errors import InputError
+from larp_model.learned.model import Model
 from larp_model.networks import Weights
-from larp_model.parts.part import Model
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from larp_model.truth.mujoco import Truth
@@ -34,8 +34,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def ball_model() -> Simulator:
-    """A ball alone, with random weights."""
-    return pushes.untrained(Scene((ball(),)), seed=0)
+    """A ball alone."""
+    return Simulator.of_physics(Scene((ball(),)))
 
 
 def lying_ball(count: int = 1) -> np.ndarray:
@@ -73,9 +73,9 @@ def test_arguments_that_do_not_fit_are_refused_by_name(ball_model: Simulator, na
 
 
 def test_the_state_decides_the_precision_also_where_jax_holds_64_bits(
-    scene: Scene, compact: Model, compact_weights: Weights, reference: Reference
+    scene: Scene, residual: Model, residual_weights: Weights, reference: Reference
 ) -> None:
-    model = Simulator(compact, compact_weights)
+    model = Simulator(residual, residual_weights)
     with jax.enable_x64(True):
         for kind in (jnp.float32, jnp.float64):
             state = jnp.asarray(reference.states[None, 0], kind)
@@ -140,7 +140,7 @@ def test_a_reference_of_bfloat16_becomes_targets_of_32_bits() -> None:
 
 @pytest.mark.parametrize("kind", ["ball", "chain"])
 def test_random_scenes_neither_crash_nor_hide_what_is_not_finite(kind: str) -> None:
-    model = pushes.untrained(pushes.drawn(kind, None), seed=0)
+    model = Simulator.of_physics(pushes.drawn(kind, None))
     found = pushes.random_scenes(kind, model, scenes=3, each=4, steps=3, seed=0)
     assert (found.tried, found.crashes, found.silent) == (12, [], 0)
 

@@ -8,12 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from larp_model import weights as stored
 from mpc import CEM
 from tasks import kick
 from tasks.benchmarks import optimizers, report, tradeoff
 from tasks.benchmarks.tradeoff import Point
-from tasks.models import WEIGHTS
 from tasks.presets import PRESETS, Preset, Seconds, scaled
 
 figure = st.floats(0.01, 100.0)
@@ -60,7 +58,7 @@ def test_a_point_is_beaten_only_by_what_is_a_tenth_better_in_both() -> None:
 def test_a_point_is_measured_and_drawn(tmp_path: Path) -> None:
     search = (CEM(samples=16, rounds=1, elites=4),)
     point = Point(Preset(search, search, every=40), "mujoco", 4)
-    row = tradeoff.measure(kick.Kick.standard(substeps=4), point, Path(), targets=2, seed=0)
+    row = tradeoff.measure(kick.Kick.standard(substeps=4), point, None, targets=2, seed=0)
     assert row["point"] == "mujoco 4: CEM 16x1 / CEM 16x1 every 40" and row["family"] == "mujoco"
     assert len(row["truth_errors_m"]) == 2
     assert row["planning_seconds"] >= row["plan_seconds"] > 0.0
@@ -78,10 +76,7 @@ def test_ways_to_search_are_fitted_into_the_time_measured_and_told(monkeypatch: 
         return scaled(preset, Seconds(0.2, 0.2, 0.2))
 
     monkeypatch.setattr("tasks.task.within", fifth)
-    weights = stored.SHIPPED / f"{WEIGHTS}.json"
-    row = optimizers.compare(
-        kick.Kick.standard(substeps=4), "Gauss-Newton, differences", weights, 0.3, targets=1, seed=0
-    )
+    row = optimizers.compare(kick.Kick.standard(substeps=4), "Gauss-Newton, differences", None, 0.3, targets=1, seed=0)
     assert given == [0.3] and row["plan_seconds"] > 0.0
     assert "Gauss-Newton, differences (GN 24x2 " in report.markdown(optimizers.table_of([row], 0.3))
     assert all(Point(Preset(*way, every=5)).name for way in optimizers.WAYS.values())

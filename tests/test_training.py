@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from larp_model import designs, training
+from larp_model import training
 from larp_model.bodies import chain, two_balls
 from larp_model.errors import InputError
+from larp_model.learned.model import Model
+from larp_model.learned.paper import PaperModel, Sizes
 from larp_model.meeting import first_contacts
-from larp_model.networks import Weights
-from larp_model.parts.part import Model
+from larp_model.networks import Size, Weights
 from larp_model.scene import Scene
 from larp_model.training import Batch, Recipe, Windows, statistics_of, train
 from larp_model.truth.episodes import Episodes, record
@@ -28,7 +29,7 @@ from larp_model.truth.mujoco import Truth
 from tasks.curve import curve_picture
 
 SWING = Scene((chain(links=2),))
-MODEL = designs.compact(SWING, designs.LEAST)
+MODEL = PaperModel(SWING, Sizes(*[Size(2, 16)] * 3))  # which compiles soonest
 SHORT = Recipe(updates=200, batch=16, curriculum=((2, 1.0),), learning_rate=3e-3)
 
 
@@ -92,9 +93,9 @@ def test_a_recipe_refuses_nonsense_by_field(field: str, value: object) -> None:
         Recipe(**{field: value})  # type: ignore[arg-type]
 
 
-def test_a_short_training_lowers_the_loss(compact: Model, episodes: Episodes, tmp_path: Path) -> None:
+def test_a_short_training_lowers_the_loss(paper: Model, episodes: Episodes, tmp_path: Path) -> None:
     recipe = Recipe(updates=200, batch=32, curriculum=((2, 1.0),), learning_rate=3e-3)
-    weights, log = train(compact, recipe, [(episodes, 1.0)], tmp_path, quiet=True)
+    weights, log = train(paper, recipe, [(episodes, 1.0)], tmp_path, quiet=True)
     losses = [row["loss"] for row in log["history"]]
     assert len(losses) == 2 and losses[-1] < 0.8 * losses[0]
     assert not log["stopped_early"] and log["history"][-1]["update"] == 200
@@ -158,7 +159,7 @@ def test_training_on_bad_data_alone_stops_with_the_last_good_weights(swings: Epi
 
 def test_training_in_the_world_frame_turns_its_data(swings: Episodes, tmp_path: Path) -> None:
     recipe = dataclasses.replace(SHORT, updates=100)
-    weights, log = train(designs.paper(SWING, designs.LEAST), recipe, [(swings, 1.0)], tmp_path, quiet=True)
+    weights, log = train(MODEL, recipe, [(swings, 1.0)], tmp_path, quiet=True)
     assert log["dropped"] == 0 and all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(weights))
     spread = np.asarray(weights.inputs["dynamics/chain2"].mean)[2:32]
     assert np.abs(spread).max() < 3.0
@@ -185,7 +186,7 @@ def test_importing_the_model_has_no_side_effects(tmp_path: Path) -> None:
 
 def test_what_the_start_lacks_begins_fresh_and_what_it_has_goes_on() -> None:
     scene = two_balls()
-    model = designs.compact(scene, designs.LEAST)
+    model = PaperModel(scene, Sizes(*[Size(2, 16)] * 3))
     states = np.zeros((4, 3, 2, 13))
     states[..., 3], states[:, :, 1, 0], states[..., 2] = 1.0, 0.3, 2.0
     given = record(Truth(scene, 4), states[:, 0], np.zeros((4, 2, 0, 3)))[0]

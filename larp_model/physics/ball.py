@@ -12,9 +12,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from larp_model import state as packed
-from larp_model.compliance import moments
 from larp_model.contact import IMPEDANCE
-from larp_model.mechanics import BodyMotion
+from larp_model.mechanics import BodyMotion, moments
 from larp_model.physics.contact import stuck_or_sliding
 from larp_model.scene import Body
 

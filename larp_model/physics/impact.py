@@ -17,9 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model.compliance import moments
 from larp_model.contact import IMPEDANCE
-from larp_model.mechanics import Articulation, Momenta, cross
+from larp_model.mechanics import Articulation, Momenta, cross, moments
 from larp_model.physics import contact
 from larp_model.physics.collision import Candidates, ContactSettings, Links, Sides, closest, picked, sides_of, turned
 from larp_model.physics.contact import ContactProblem
@@ -262,7 +261,7 @@ class System:
             (self.coupled, at_contact[0] + self.mean * at_contact[1]), (self.same, of_balls),
         ):  # fmt: skip
             signs, rows, columns = self.sign[first] * self.sign[second], self.contact_of[first], self.contact_of[second]
-            for row, column, sign, matrix in zip(rows, columns, signs, matrices, strict=True):
+            for row, column, sign, matrix in zip(rows, columns, signs.tolist(), matrices, strict=True):
                 blocks[row][column] += sign * matrix
         return jnp.stack([jnp.stack(row) for row in blocks])
 

@@ -5,7 +5,7 @@ Where links touch within a step, the scene's step is made of two halves, each wi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -51,13 +51,13 @@ Correction = Callable[[Body, Array, Array, BodyMotion, float], BodyMotion]
 
 def step(
     scene: Scene, state: Array, control: Array, torque: Array, morphology: Array,
-    constants: Mapping[str, Constants], settings: ContactSettings,
+    constants: Constants, settings: ContactSettings,
     correct: Correction = lambda body, state, sizes, motion, dt: motion,
 ) -> Array:  # fmt: skip
     """Return states (B, L, 13) one `scene.dt` after states (B, L, 13).
 
-    control (B, J, 3) [rad], torque (B, L, 3) [N m], morphology (B or 1, L, 3). constants: of the articulated bodies, by
-    name. correct: see `Correction`.
+    control (B, J, 3) [rad], torque (B, L, 3) [N m], morphology (B or 1, L, 3). correct: see
+    `Correction`.
     """
     before, targets, torques = (jnp.moveaxis(each, 0, -1) for each in (state, control, torque))
     sizes = jnp.broadcast_to(jnp.moveaxis(morphology, 0, -1), (len(scene.links), 3, state.shape[0]))
@@ -73,7 +73,7 @@ def step(
             else:
                 aims = given.targets[scene.motor_rows(body.name)]
                 motion, articulations[body.name] = articulated_motion(
-                    body, state, aims, torques, sizes, scene.gravity, dt, constants[body.name]
+                    body, state, aims, torques, sizes, scene.gravity, dt, constants
                 )
             motions.append(correct(body, state, sizes, motion, dt))
         return BodyMotion(*(jnp.concatenate(each) for each in zip(*motions, strict=True))), articulations
@@ -90,7 +90,8 @@ def step(
     motion, articulations = free(given, scene.dt, ball_motion)
     after = _after(before, motion)
     if scene.pairs:
-        gaps = candidates.gaps(_links(scene, given, motion, articulations, scene.dt), scene.dt, settings)
+        links = _links(scene, given, motion, articulations, scene.dt)
+        gaps = candidates.gaps(links, scene.dt, settings)
         near = jnp.min(gaps, axis=0) < settings.margin
         after = _where(near, lambda given: jax.lax.scan(half, given, length=2)[0].state, given, after)
     return jnp.moveaxis(after, -1, 0)
@@ -99,7 +100,11 @@ def step(
 def _where(near: Array, finely: Callable[[Given], Array], given: Given, otherwise: Array) -> Array:
     """Return states (L, 13, B) by `finely` where near (B,), chunk by chunk, and the other states elsewhere."""
     count = near.shape[0]
-    size = min(CHUNK, count)
+    # The count may be a symbol: see `jax.export`.
+    size = min(CHUNK, count) if isinstance(count, int) else count
+    if size == count:
+        found = jax.lax.cond(jnp.any(near), finely, lambda given: given.state, given)
+        return jnp.where(near, found, otherwise)
     order = jnp.argsort(~near)
     rows = order[np.minimum(np.arange(count + -count % size), count - 1)].reshape(-1, size)
 
@@ -107,11 +112,8 @@ def _where(near: Array, finely: Callable[[Given], Array], given: Given, otherwis
         own: Given = jax.tree.map(lambda each: each[..., rows], given)
         return None, jax.lax.cond(jnp.any(near[rows]), finely, lambda given: given.state, own)
 
-    if len(rows) == 1:
-        found = jax.lax.cond(jnp.any(near), finely, lambda given: given.state, given)
-    else:
-        _, chunks = jax.lax.scan(chunk, None, rows)
-        found = jnp.moveaxis(chunks, 0, -2).reshape(*otherwise.shape[:2], -1)[..., jnp.argsort(order)]
+    _, chunks = jax.lax.scan(chunk, None, rows)
+    found = jnp.moveaxis(chunks, 0, -2).reshape(*otherwise.shape[:2], -1)[..., jnp.argsort(order)]
     return jnp.where(near, found, otherwise)
 
 

@@ -25,7 +25,6 @@ import numpy as np
 from jax import Array
 
 from larp_model import state as packed
-from larp_model import weights as stored
 from larp_model.bodies import human_and_ball
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
@@ -46,7 +45,6 @@ AWAY = 100.0
 OFFSETS = 0.02
 # A ball in flight, so many steps after the strike.
 FLYING = 8
-WEIGHTS = stored.SHIPPED / "human_ball.json"
 PIPELINES = ("generalized", "spring", "positional")
 
 NAMES = {
@@ -150,9 +148,8 @@ class Traced(NamedTuple):
 
 
 def larp(scene: Scene, substeps: int) -> Traced:
-    """The learned simulator with the shipped weights."""
-    model, weights, _ = stored.load(WEIGHTS, scene)
-    simulator = Simulator(model, weights)
+    """The simulator that ships."""
+    simulator = Simulator.of_physics(scene)
 
     def ball(state: Array) -> Array:
         return jnp.concatenate([state[:, -1, packed.POSITION], state[:, -1, packed.VELOCITY]], axis=-1)

@@ -20,7 +20,6 @@ from rich.table import Table
 from scipy.stats import spearmanr
 
 from larp_model import evaluation
-from larp_model import weights as stored
 from larp_model.errors import InputError
 from larp_model.simulator import Simulator
 from larp_model.truth.episodes import Episodes
@@ -30,7 +29,7 @@ from tasks.benchmarks import report
 from tasks.command import prepare_jax, run
 from tasks.data import random_task
 from tasks.kick import Kick
-from tasks.models import WEIGHTS, Models, models_of
+from tasks.models import Models, models_of
 from tasks.presets import preset_of
 
 # A candidate is one of the plan's elites, moved by this share of the spread of a first plan.
@@ -117,7 +116,7 @@ def main(
     candidates: int = 64,
     seed: int = 0,
     json: Path = Path("runs/benchmarks/gap.json"),
-    weights: Path = stored.SHIPPED / f"{WEIGHTS}.json",
+    weights: Path | None = None,
     publish: bool = False,
 ) -> None:
     """Compare model and truth on the planner's own candidates.
@@ -127,19 +126,18 @@ def main(
         candidates: of each plan.
         seed: of targets, ball spots and planner.
         json: where the figures go; the picture goes beside them.
-        weights: manifest of the weights of the learned model.
+        weights: manifest of weights that correct larp's physics; none by default.
         publish: put the table into RESULTS.md.
     """
     for name, value in (("targets", targets), ("candidates", candidates)):
         if value < 1:
             raise InputError(f"{name} is {value}, but must be at least 1")
-    report.ready(json, publish)
+    report.ready(json, publish, weights)
     prepare_jax()
     kick = Kick.standard()
-    models, truth = models_of(kick.scene, "larp", weights), models_of(kick.scene, "mujoco", weights)
+    models, truth = models_of(kick.scene, "larp", weights), models_of(kick.scene, "mujoco")
     rows, episodes = candidates_of(kick, models, truth, targets, candidates, seed)
-    model, learned, _ = stored.load(weights, kick.scene)
-    simulator = Simulator(model, learned)
+    simulator = Simulator.of_physics(kick.scene) if weights is None else Simulator.load(weights, kick.scene)
     launch = evaluation.launched(simulator, episodes)
     ranks = {
         name: float(np.median([row["rank_correlation"] for row in rows[which::3]]))

@@ -103,9 +103,9 @@ def main(
         targets: how many kicks.
         seed: of targets, ball spots and planner.
         preset: fast, balanced or accurate.
-        dynamics: the planner's model: larp, physics or mujoco.
+        dynamics: the planner's model: larp or mujoco.
         json: where the figures go; the picture goes beside them.
-        weights: manifest of the weights of the learned model; those shipped for the kick by default.
+        weights: manifest of weights that correct larp's physics; none by default.
         reference: a captured kick (BVH) instead of the embedded one.
         height: of the human [m].
         bodies: varied: every kick is another human's, of any size.
@@ -138,11 +138,11 @@ def main(
     said = {option: value for option, value in variant.items() if value}
     name = "_".join(["kick", preset, dynamics, *(f"{option}_{value}" for option, value in said.items())])
     json = json or Path(f"runs/benchmarks/{name}.json")
-    report.ready(json, publish)
+    report.ready(json, publish, weights)
     prepare_jax()
 
     def planned(kick: Kick) -> tuple[Kick, Models, Planners]:
-        models = models_of(kick.scene, dynamics, weights or kick.weights)
+        models = models_of(kick.scene, dynamics, weights)
         fitting = chosen if budget is None else kick.within(chosen, budget, models, USUAL)
         return kick, models, kick.planners_of(fitting, models)
 

@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from larp_model import evaluation
-from larp_model import weights as stored
 from larp_model.designs import DesignName
 from larp_model.errors import InputError
 from larp_model.scene import Scene
@@ -24,7 +23,6 @@ from larp_model.truth.bullet import BulletTruth
 from larp_model.truth.episodes import Episodes
 from tasks.benchmarks import report
 from tasks.command import prepare_jax, run
-from tasks.models import WEIGHTS
 from tasks.scenarios import Scenario, around, scenario, trained_at
 
 # A step is timed with so many scenes side by side, over so many steps.
@@ -50,19 +48,8 @@ def picture(windows: dict[str, dict[str, float]], chosen: Scenario, title: str) 
     return figure
 
 
-def weights_of(name: str, weights: Path | None) -> Path:
-    """The manifest of a scene's weights: the one asked for, or the shipped one."""
-    manifest = weights or stored.SHIPPED / f"{name}.json"
-    if weights is None and not manifest.is_file():
-        raise InputError(
-            f"weights of {name} are not shipped: train them with python -m tasks.train --scene {name}, and name their "
-            "manifest with --weights"
-        )
-    return manifest
-
-
 def main(
-    scene: str = WEIGHTS,
+    scene: str = "human_ball",
     sequences: int = 256,
     seed: int = 1,
     json: Path | None = None,
@@ -72,7 +59,6 @@ def main(
     bodies: Literal["usual", "varied"] = "usual",
     beside: DesignName | None = None,
     bullet: bool = False,
-    untrained: bool = False,
     publish: bool = False,
 ) -> None:
     """Compare rollouts of the learned simulator with truth episodes from unseen initial states.
@@ -82,30 +68,25 @@ def main(
         sequences: truth episodes.
         seed: of the episodes.
         json: where the figures go; the picture goes beside them.
-        weights: manifest of the weights; the shipped ones by default.
+        weights: manifest of weights that correct physics; none by default.
         states: truth episodes (.npz) to evaluate on instead.
         reference: a captured kick (BVH) to draw the episodes around.
         bodies: varied draws another human for every episode.
         beside: weights of this design, from where `tasks.train --design` leaves them, on the same episodes.
         bullet: also how far Bullet, the second truth, strays from the first.
-        untrained: physics alone, with nothing learned.
         publish: put the table into RESULTS.md.
     """
-    if untrained and weights:
-        raise InputError(f"untrained is set, but weights is {str(weights)!r}: physics alone has none")
     chosen = around(scenario(scene), reference, bodies == "varied")
     if sequences < 1:
         raise InputError(f"sequences is {sequences}, but must be at least 1")
-    manifest = None if untrained else weights_of(scene, weights)
     what = [
         scene,
         *(path.stem for path in (weights, reference) if path),
         *(["bodies varied"] if bodies == "varied" else []),
-        *(["untrained"] if untrained else []),
     ]
     name = "_".join(["model", *what]).replace(" ", "_")
     json = json or Path(f"runs/benchmarks/{name}.json")
-    report.ready(json, publish)
+    report.ready(json, publish, weights)
     prepare_jax()
     other = trained_at(scene, beside) / "weights" / f"{scene}.json"
     if beside and not other.is_file():
@@ -113,7 +94,7 @@ def main(
             f"beside is {beside}, but {other} is not there: `python -m tasks.train --scene {scene} --design {beside}`"
         )
     episodes = chosen.draw(sequences, seed)[0] if states is None else truth_episodes.load(states, chosen.scene)
-    found = judged(manifest, chosen, episodes)
+    found = judged(weights, chosen, episodes)
     source = f"--states {states.name}" if states else f"--sequences {sequences} --seed {seed}"
     if weights:
         source = f"--weights {weights} {source}"
@@ -121,8 +102,6 @@ def main(
         source += f" --reference {reference.name}"
     if bodies == "varied":
         source += " --bodies varied"
-    if untrained:
-        source += " --untrained"
     if beside:
         source += f" --beside {beside}"
         found["beside"] = {"design": beside, **judged(other, chosen, episodes)}
@@ -142,10 +121,8 @@ def main(
 
 def judged(manifest: Path | None, chosen: Scenario, episodes: Episodes) -> dict[str, Any]:
     """Return errors of some weights, or of physics alone (see `evaluation.evaluate`), and the time of a step."""
-    if manifest is None:
-        simulator = Simulator.of_physics(chosen.scene)
-    else:
-        simulator = Simulator(*stored.load(manifest, chosen.scene)[:2])
+    scene = chosen.scene
+    simulator = Simulator.of_physics(scene) if manifest is None else Simulator.load(manifest, scene)
     found = evaluation.evaluate(simulator, episodes, chosen.windows)
     return found | {"us_per_step": {str(size): step_time(simulator, episodes, size) for size in BATCHES}}
 

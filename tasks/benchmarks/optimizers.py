@@ -7,14 +7,13 @@ from pathlib import Path
 
 from rich.table import Table
 
-from larp_model import weights as stored
 from larp_model.errors import InputError
 from mpc import CEM, MPPI, GaussNewton, Gradient
 from tasks.benchmarks import report
 from tasks.benchmarks.tradeoff import Point, measure
 from tasks.command import prepare_jax, run
 from tasks.kick import USUAL, Kick
-from tasks.models import WEIGHTS, models_of
+from tasks.models import models_of
 from tasks.presets import Preset, Stage
 
 SAMPLING, SOME = CEM(samples=64, rounds=16, elites=12, decay=1.0), CEM(samples=32, rounds=4, elites=8, decay=1.0)
@@ -30,7 +29,7 @@ WAYS: dict[str, tuple[Stage, Stage]] = {
 }
 
 
-def compare(kick: Kick, name: str, weights: Path, seconds: float, targets: int, seed: int) -> report.Row:
+def compare(kick: Kick, name: str, weights: Path | None, seconds: float, targets: int, seed: int) -> report.Row:
     """A way to search, its first plan fitted into `seconds` and each replan into a fifth of them."""
     first, again = WAYS[name]
     models = models_of(kick.scene, "larp", weights)
@@ -59,7 +58,7 @@ def main(
     targets: int = 32,
     seed: int = 7,
     json: Path = Path("runs/benchmarks/optimizers.json"),
-    weights: Path = stored.SHIPPED / f"{WEIGHTS}.json",
+    weights: Path | None = None,
     publish: bool = False,
 ) -> None:
     """Compare sampling, gradients, Gauss-Newton and both, each in the same time a plan, over the same kicks.
@@ -69,12 +68,12 @@ def main(
         targets: kicks a way; the same for all.
         seed: of targets, ball spots and planner.
         json: where the figures go.
-        weights: manifest of the weights of the learned model.
+        weights: manifest of weights that correct larp's physics; none by default.
         publish: put the table into RESULTS.md.
     """
     if targets < 1:
         raise InputError(f"targets is {targets}, but must be at least 1")
-    report.ready(json, publish)
+    report.ready(json, publish, weights)
     prepare_jax()
     kick = Kick.standard()
     command = f"python -m tasks.benchmarks.optimizers --seconds {seconds:g} --targets {targets} --seed {seed}"

@@ -19,9 +19,7 @@ from scipy.spatial.transform import Rotation
 from larp_model import contact, kinematics
 from larp_model import state as packed
 from larp_model.bodies import ball, capsule, chain, human, kicking_links
-from larp_model.designs import LEAST, compact
 from larp_model.errors import InputError
-from larp_model.parts.part import initial_weights, measure
 from larp_model.scene import Pair, Scene
 from larp_model.simulator import Simulator
 from larp_model.truth.mujoco import Truth
@@ -129,7 +127,7 @@ def standing(scene: Scene, state: np.ndarray) -> np.ndarray:
 
 
 def sizes(bench: Bench, body: str, field: str) -> list[Row]:
-    """One size of the human or the ball, from a tenth to ten times what the weights have seen."""
+    """One size of the human or the ball, from a tenth to ten times its own."""
     scene, rows = bench.kick.scene, bench.kick.scene.rows(body)
     scenes = [scaled(scene, body, field, factor) for factor in FACTORS]
     starts = np.stack([standing(each, bench.kick.start()) for each in scenes])
@@ -549,15 +547,6 @@ def wild(scene: Scene, count: int, random: np.random.Generator) -> np.ndarray:
         size = most * 10.0 ** random.uniform(-4.0, 0.0, (count, 1, 1))
         states[..., columns] = size * random.uniform(-1.0, 1.0, (count, len(scene.links), 3)) / np.sqrt(3.0)
     return states
-
-
-def untrained(scene: Scene, seed: int) -> Simulator:
-    """A simulator of the scene with small random networks, its inputs measured on wild states."""
-    states = wild(scene, 64, np.random.default_rng(seed)).astype(np.float32)
-    control, torque = jnp.zeros((64, len(scene.motors), 3)), jnp.zeros((64, len(scene.links), 3))
-    model = compact(scene, LEAST)
-    measured = measure(model, jnp.asarray(states), jnp.asarray(states[::-1].copy()), control, torque)
-    return Simulator(model, initial_weights(model, jax.random.key(seed), measured))
 
 
 class Tally(NamedTuple):

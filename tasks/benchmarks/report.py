@@ -6,6 +6,7 @@ import hashlib
 import json
 import platform
 import re
+import subprocess
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -25,15 +26,25 @@ RESULTS = Path("RESULTS.md")
 # Pictures that the README shows.
 PICTURES = Path("docs")
 PROJECT = Path(__file__).parents[2]
+PACKAGES = ("larp_model", "mpc", "tasks")
 
 Row = dict[str, Any]
 
 
-def ready(path: Path, publish: bool) -> None:
-    """Refuses, before anything is computed, a JSON that could not be written or results that have no place."""
+def ready(path: Path, publish: bool, weights: Path | None = None) -> None:
+    """Refuse, before anything is computed, a JSON that could not be written or results that have no place.
+
+    Only what ships is published: no weights, and code that is committed.
+    """
     require_writable(path.parent, "json")
-    if publish and not RESULTS.is_file():
+    if not publish:
+        return
+    if not RESULTS.is_file():
         raise InputError(f"publish is set, but {RESULTS} is not in this folder: run it where the project lies")
+    if weights is not None:
+        raise InputError(f"publish is set, but weights is {str(weights)!r}: results are those of what ships")
+    if changed := _git("status", "--porcelain", "--", *PACKAGES):
+        raise InputError(f"publish is set, but {changed.split()[-1]} differs from what is committed")
 
 
 def collect(path: Path, command: str, jobs: Mapping[str, Callable[[], Row]]) -> list[Row]:
@@ -78,10 +89,19 @@ def _duration(seconds: float) -> str:
     return f"about {minutes} min" if minutes else f"about {rest} s"
 
 
+def _git(*arguments: str) -> str:
+    """Return what git says of this project."""
+    try:
+        found = subprocess.run(["git", *arguments], cwd=PROJECT, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        raise InputError(f"publish is set, but git does not know {PROJECT.name}: {error}") from None
+    return found.stdout.strip()
+
+
 def version() -> str:
     """A digest of what a figure depends on: the code and the weights, other benchmarks included."""
     digest = hashlib.sha256()
-    for package in ("larp_model", "mpc", "tasks"):
+    for package in PACKAGES:
         for file in sorted((PROJECT / package).rglob("*")):
             if file.suffix in (".py", ".json", ".safetensors"):
                 digest.update(file.relative_to(PROJECT).as_posix().encode())
@@ -123,7 +143,8 @@ def publish(name: str, title: str, command: str, *tables: Table) -> None:
     first, *others = map(markdown, tables)
     texts = [first, *(f"{table.title}:\n\n{other}" for table, other in zip(tables[1:], others, strict=True))]
     shown = "\n\n".join(texts)
-    part = f"{begin}\n## {title}\n\n`{command}`\n\n{shown}\n\nMeasured on {hardware()}.\n{end}"
+    made_by = f"Measured on {hardware()}, at commit {_git('rev-parse', '--short=10', 'HEAD')}, with nothing learned."
+    part = f"{begin}\n## {title}\n\n`{command}`\n\n{shown}\n\n{made_by}\n{end}"
     text = RESULTS.read_text()
     if begin in text:
         before, after = text.split(begin)[0], text.split(end)[1]

@@ -26,7 +26,7 @@ from rich.table import Table
 from larp_model.errors import InputError
 from larp_model.truth.mujoco import SUBSTEPS as CONVERGED
 from tasks.benchmarks import replays, report
-from tasks.benchmarks.engines import NAMES, PIPELINES, WEIGHTS, Question, case, titled
+from tasks.benchmarks.engines import NAMES, PIPELINES, Question, case, titled
 from tasks.command import prepare_jax, run
 from tasks.data import random_task
 from tasks.kick import Kick
@@ -145,7 +145,7 @@ def price(engine: str, substeps: int, seed: int) -> Question:
 def kicks_of(engines: list[replays.Engine], count: int, seed: int) -> dict[str, partial[report.Row]]:
     """The jobs of executed and replayed kicks, by name."""
     kick = Kick.standard()
-    planners = kick.planners_of(preset_of(PRESET), models_of(kick.scene, "larp", WEIGHTS))
+    planners = kick.planners_of(preset_of(PRESET), models_of(kick.scene, "larp"))
     random = np.random.default_rng(seed)
 
     @cache

@@ -13,7 +13,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from larp_model import weights as stored
 from larp_model.errors import InputError
 from larp_model.truth.mujoco import SUBSTEPS
 from mpc import CEM, MPPI, GaussNewton, Gradient, Optimizer, Unless
@@ -21,7 +20,7 @@ from tasks.benchmarks import report
 from tasks.command import prepare_jax, run
 from tasks.data import random_task
 from tasks.kick import Kick
-from tasks.models import FLIGHT, WEIGHTS, models_of
+from tasks.models import FLIGHT, models_of
 from tasks.presets import PRESETS, Preset
 from tasks.task import BEYOND
 
@@ -151,7 +150,7 @@ def _around() -> Iterator[Point]:
         yield Point(Preset((cem(64, 8, 12),), (few,), every=5), "mujoco", substeps)
 
 
-def measure(kick: Kick, point: Point, weights: Path, targets: int, seed: int) -> report.Row:
+def measure(kick: Kick, point: Point, weights: Path | None, targets: int, seed: int) -> report.Row:
     """Kicks to the first `targets` random targets of a seed, without the standing that follows them."""
     models = models_of(kick.scene, point.dynamics, weights, substeps=point.substeps)  # type: ignore[arg-type]
     planners = kick.planners_of(point.preset, models)
@@ -255,7 +254,7 @@ def main(
     targets: int = 16,
     seed: int = 3,
     json: Path = Path("runs/benchmarks/tradeoff.json"),
-    weights: Path = stored.SHIPPED / f"{WEIGHTS}.json",
+    weights: Path | None = None,
     publish: bool = False,
 ) -> None:
     """Measure truth error and planning time of many ways to plan, and where the presets stand among them.
@@ -264,12 +263,12 @@ def main(
         targets: kicks a point; the same for all.
         seed: of targets, ball spots and planner.
         json: where the figures go; the picture goes beside them.
-        weights: manifest of the weights of the learned model.
+        weights: manifest of weights that correct larp's physics; none by default.
         publish: put the table into RESULTS.md and the picture into docs/.
     """
     if targets < 1:
         raise InputError(f"targets is {targets}, but must be at least 1")
-    report.ready(json, publish)
+    report.ready(json, publish, weights)
     prepare_jax()
     kick = Kick.standard()
     command = f"python -m tasks.benchmarks.tradeoff --targets {targets} --seed {seed}"

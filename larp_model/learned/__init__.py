@@ -1,0 +1,1 @@
+"""What is learned: networks that correct physics, and the paper's."""

@@ -1,0 +1,80 @@
+"""A model of a scene: how its state moves on in a step, and which networks that needs."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, Self
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from larp_model import state as packed
+from larp_model.networks import Measured, Perceptron, Weights
+from larp_model.scene import Body, Scene
+
+
+class Model(Protocol):
+    """Frozen and static under jit: all that weights depend on is a field of it, and so in their manifest."""
+
+    @property
+    def scene(self) -> Scene:
+        """Return the scene."""
+
+    @property
+    def invariant(self) -> bool:
+        """Return whether turning the world about z turns what the model does; else training has to teach it."""
+
+    @property
+    def side_by_side(self) -> int:
+        """Return how many rollouts at a time take least, each, on a CPU."""
+
+    def on(self, scene: Scene) -> Self:
+        """Return the same model of a scene of bodies of the same kinds, or of some of them."""
+
+    def networks(self) -> dict[str, Perceptron]:
+        """Return the networks by name; bodies of one kind share theirs, which `bodies_of` tells by the name."""
+
+    def step(
+        self, weights: Weights, state: Array, control: Array, torque: Array, morphology: Array, stop_gradient: bool
+    ) -> Array:
+        """Return states (B, L, 13) one `scene.dt` after states (B, L, 13).
+
+        control (B, J, 3) joint targets [rad], torque (B, L, 3) [N m] from outside, world frame, morphology
+        (B or 1, L, 3). stop_gradient: for training, take derivatives as if what networks see did not depend on them.
+        """
+
+    def measure(self, before: Array, after: Array, control: Array, torque: Array, morphology: Array) -> Measured:
+        """Return statistics of the networks' inputs and outputs, from true steps (B, L, 13) -> (B, L, 13)."""
+
+
+def network_name(kind: str, *bodies: Body) -> str:
+    """Return the name of the network of bodies of these kinds: "dynamics/human", "contact/ball-human"."""
+    if len(bodies) == 2 and bodies[0] == bodies[1]:
+        return f"{kind}/{bodies[0].kind}-itself"
+    return f"{kind}/{'-'.join(body.kind for body in bodies)}"
+
+
+def initial_weights(model: Model, key: Array, statistics: Measured) -> Weights:
+    """Return fresh networks; `statistics` as `Model.measure` gives them."""
+    networks: dict[str, Any] = {}
+    for index, (name, module) in enumerate(sorted(model.networks().items())):
+        size = statistics[name][0].mean.shape[0]
+        networks[name] = module.init(jax.random.fold_in(key, index), jnp.zeros((1, size)))
+    inputs = {name: statistics[name][0].floored for name in networks}
+    outputs = {name: found.floored for name in networks if (found := statistics[name][1]) is not None}
+    return Weights(networks, inputs, outputs)
+
+
+def blank_weights(model: Model) -> Weights:
+    """Return the shapes and types of a model's weights."""
+    scene = model.scene
+
+    def make() -> Weights:
+        state = jnp.zeros((1, len(scene.links), packed.SIZE))
+        control, torque = jnp.zeros((1, len(scene.motors), 3)), jnp.zeros((1, len(scene.links), 3))
+        sizes = jnp.zeros((1, len(scene.links), 3))
+        return initial_weights(model, jax.random.key(0), model.measure(state, state, control, torque, sizes))
+
+    blank = jax.eval_shape(make)
+    assert isinstance(blank, Weights)
+    return blank

@@ -1,1 +1,0 @@
-"""The learned parts of a simulator, one a file: see `part`."""
