@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from functools import partial
 from pathlib import Path
 
@@ -73,6 +74,7 @@ def test_results_are_published_only_where_the_project_lies(tmp_path: Path, monke
 def test_publishing_replaces_a_part_and_leaves_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     report.RESULTS.write_text("# Results\n")
+    monkeypatch.setattr(report, "_git", lambda *arguments: "0123456789")
     table = Table("measure", "value")
     table.add_row("speed", "1")
     for name in ("one", "two", "one"):
@@ -80,7 +82,31 @@ def test_publishing_replaces_a_part_and_leaves_the_others(tmp_path: Path, monkey
     text = report.RESULTS.read_text()
     assert text.count("## One") == text.count("## Two") == 1
     assert text.index("## One") < text.index("## Two")
-    assert "| speed | 1 |" in text
+    assert "| speed | 1 |" in text and not unsigned(text)
+
+
+def unsigned(results: str) -> list[str]:
+    """Return the names of published tables that do not say at which commit, and of what, they are."""
+    parts = re.findall(r"<!-- (\S+) -->\n(.*?)<!-- end of \1 -->", results, re.DOTALL)
+    assert len(parts) == results.count("\n## "), "every table is a published one"
+    signed = re.compile(r"\nMeasured on .+, at commit [0-9a-f]{10}, with nothing learned\.\n$")
+    return [name for name, text in parts if not signed.search(text)]
+
+
+def test_every_published_table_names_its_commit_and_is_of_what_ships() -> None:
+    results = (report.PROJECT / report.RESULTS).read_text()
+    assert results.count("\n## ") >= 3 and not unsigned(results)
+    assert unsigned(results.replace("nothing learned", "weights 0123abcd"))
+
+
+def test_only_what_is_committed_and_ships_is_published(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    report.RESULTS.touch()
+    with pytest.raises(InputError, match=r"weights is 'some\.json': results are those of what ships"):
+        report.ready(tmp_path / "kick.json", publish=True, weights=Path("some.json"))
+    monkeypatch.setattr(report, "_git", lambda *arguments: "M tasks/kick.py")
+    with pytest.raises(InputError, match=r"tasks/kick\.py differs from what is committed"):
+        report.ready(tmp_path / "kick.json", publish=True)
 
 
 def test_the_kick_benchmark_keeps_its_rows_and_touches_no_results(
