@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import jax
@@ -18,26 +17,15 @@ LOST = 1.0
 
 
 class LossWeights(NamedTuple):
-    """Weights of the terms, and how far their errors count as squares.
-
-    velocity [s^2] is not in the paper, which rightly finds that it cannot replace position. Errors beyond `far` [m] and
-    `fast` [m/s] count linearly: impacts that nothing can predict would otherwise drown those that can be learned.
-    Angular velocities count as velocities at a distance of `arm` [m]: single steps hardly teach them otherwise.
-    """
+    """Weights of the terms: squared distance [m^2], 1 - |q . q'|, and squared joint displacement [m^2]."""
 
     position: float = 1.0
     rotation: float = 1.0
     displacement: float = 0.1
-    velocity: float = 0.0
-    far: float = math.inf
-    fast: float = 1.0
-    arm: float = 0.0
 
 
 def pseudo_huber(squared: Array, limit: float) -> Array:
-    """A squared error that becomes linear beyond `limit`."""
-    if math.isinf(limit):
-        return squared
+    """Return squared errors that become linear beyond `limit`."""
     return 2.0 * limit**2 * (jnp.sqrt(1.0 + squared / limit**2) - 1.0)
 
 
@@ -49,16 +37,6 @@ def position(predicted: Array, true: Array) -> Array:
 def rotation(predicted: Array, true: Array) -> Array:
     """1 - |q . q'| (*, L)."""
     return 1.0 - jnp.abs(jnp.sum(packed.orientation(predicted) * packed.orientation(true), axis=-1))
-
-
-def velocity(predicted: Array, true: Array) -> Array:
-    """Squared difference (*, L) [m^2/s^2] of the links' velocities."""
-    return jnp.sum((packed.velocity(predicted) - packed.velocity(true)) ** 2, axis=-1)
-
-
-def spin(predicted: Array, true: Array) -> Array:
-    """Squared difference (*, L) [rad^2/s^2] of the links' angular velocities."""
-    return jnp.sum((packed.angular_velocity(predicted) - packed.angular_velocity(true)) ** 2, axis=-1)
 
 
 def displacement(scene: Scene, predicted: Array, morphology: Array) -> Array:
@@ -82,12 +60,9 @@ def total(
         return jnp.sum(kept * jnp.sum(values, axis=2)) / (jnp.maximum(jnp.sum(kept), 1.0) * places.shape[2])
 
     terms = {
-        "position": mean(emphasis * pseudo_huber(places, weights.far)),
+        "position": mean(emphasis * places),
         "rotation": mean(rotation(predicted, true)),
         "displacement": mean(displacement(scene, predicted, morphology[:, None])),
-        "velocity": mean(emphasis * pseudo_huber(velocity(predicted, true), weights.fast)),
-        "spin": mean(emphasis * pseudo_huber(weights.arm**2 * spin(predicted, true), weights.fast)),
     }
-    factors = weights._asdict() | {"spin": weights.velocity}
-    loss = jnp.sum(jnp.stack([factors[name] * value for name, value in terms.items()]))
+    loss = jnp.sum(jnp.stack([weight * terms[name] for name, weight in weights._asdict().items()]))
     return loss, terms | {"lost": 1.0 - jnp.mean(kept)}

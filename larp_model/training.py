@@ -42,9 +42,7 @@ class Recipe:
 
     curriculum: (unroll in steps, share of the updates) in order. learning_rate falls to `final` of itself by a cosine.
     clip: largest gradient norm. drop: norm beyond which a batch is dropped. contact_share: windows that start from
-    `before_contact` steps before to `after_contact` steps after the first contact of two bodies. emphasis: weight of
-    each body's links in the loss. only: beginnings of the names of the networks to train; the others stay as they are.
-    None: all.
+    `before_contact` steps before the first contact of two bodies on. emphasis: weight of each body's links in the loss.
     """
 
     updates: int = 20000
@@ -56,11 +54,9 @@ class Recipe:
     drop: float = 30.0
     contact_share: float = 0.7
     before_contact: int = 10
-    after_contact: int = 0
     emphasis: tuple[tuple[str, float], ...] = (("ball", 3.0), ("capsule", 3.0))
     loss: LossWeights = field(default_factory=LossWeights)
     stop_gradient: bool = True
-    only: tuple[str, ...] = ()
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -78,11 +74,6 @@ class Recipe:
             if update < done:
                 return steps
         return self.curriculum[-1][0]
-
-    def split(self, networks: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Networks, by name, that are trained, and those that stay as they are."""
-        trained = {name: value for name, value in networks.items() if name.startswith(self.only or "")}
-        return trained, {name: value for name, value in networks.items() if name not in trained}
 
 
 class Progressed(NamedTuple):
@@ -125,7 +116,7 @@ class Windows:
             if last < 0:
                 raise InputError(f"episodes have {source.controls.shape[1]} steps, but the unroll needs {steps}")
             start = random.integers(last + 1, size=count)
-            back = random.integers(-self.recipe.after_contact, self.recipe.before_contact + 1, size=near)
+            back = random.integers(self.recipe.before_contact + 1, size=near)
             start[:near] = np.clip(contacts[chosen[:near]] - back, 0, last)
             columns = start[:, None] + np.arange(steps + 1)
             rows = chosen[:, None]
@@ -152,14 +143,6 @@ def statistics_of(model: Model, windows: Windows, random: np.random.Generator, b
     return initial_weights(model, jax.random.key(int(random.integers(2**31))), found)
 
 
-def begun(model: Model, windows: Windows, random: np.random.Generator, start: Weights | None) -> Weights:
-    """The weights that training begins with: those of `start`, and fresh ones for what it lacks."""
-    if start is not None and set(start.networks) >= set(model.networks()):
-        return start
-    fresh = statistics_of(model, windows, random)
-    return fresh if start is None else Weights(*(new | old for new, old in zip(fresh, start, strict=True)))
-
-
 def emphasis(scene: Scene, recipe: Recipe) -> Array:
     """Weight (L,) of each link in the loss."""
     factors = dict(recipe.emphasis)
@@ -181,20 +164,19 @@ def learning_rate(recipe: Recipe, update: int) -> float:
 
 
 Update = Callable[[dict[str, Any], Any, Array, Any, float | Array], tuple[dict[str, Any], Any, dict[str, Array]]]
-"""(trained networks, the optimiser's state, key, `Batch`, learning rate) -> both anew, and losses and norms by name."""
+"""(networks, the optimiser's state, key, `Batch`, learning rate) -> both anew, and losses and norms by name."""
 
 
 def update_of(model: Model, recipe: Recipe, weights: Weights) -> Update:
     """Return one step of gradient descent as a pure function; see `Update`.
 
-    Of `weights` the networks that are not trained and the statistics count. A batch whose gradient is not finite, or
-    beyond `recipe.drop`, changes nothing.
+    Of `weights` the statistics count. A batch whose gradient is not finite, or beyond `recipe.drop`, changes nothing.
     """
     scene, transform = model.scene, optimiser(recipe)
-    weigh, (_, fixed) = emphasis(scene, recipe), recipe.split(weights.networks)
+    weigh = emphasis(scene, recipe)
 
     def loss_of(networks: dict[str, Any], states: Array, drawn: Any) -> tuple[Array, dict[str, Array]]:
-        whole = weights._replace(networks=fixed | networks)
+        whole = weights._replace(networks=networks)
         if isinstance(model, ResidualModel):
             return step_loss(model, whole, states, drawn)
         predicted = rollout(
@@ -258,23 +240,22 @@ def train(
     """Train on sources of (trajectories, share); returns the weights and a log of loss, norms and drops.
 
     folder: where checkpoints are kept, and logs for TensorBoard; a run cut off there goes on from its last. start:
-    weights to go on from; what they lack begins fresh. seconds: only as many of the updates as fit into them, judged by
+    weights to go on from; fresh ones by default. seconds: only as many of the updates as fit into them, judged by
     the first. Where a hundred batches in a row are dropped, the last good weights are returned and the log says so.
     """
     from tensorboardX import SummaryWriter  # whose import sets a variable of the environment
 
     random = np.random.default_rng(recipe.seed)
     windows = Windows(model.scene, sources, recipe)
-    weights = begun(model, windows, random, start)
-    trained, fixed = recipe.split(weights.networks)
-    progressed = Progressed(trained, optimiser(recipe).init(trained), 0)
+    weights = start or statistics_of(model, windows, random)
+    progressed = Progressed(weights.networks, optimiser(recipe).init(weights.networks), 0)
     manager = ocp.CheckpointManager(
         (folder / "checkpoints").absolute(), options=ocp.CheckpointManagerOptions(max_to_keep=1, create=True)
     )
     if manager.latest_step() is not None:
         restored = manager.restore(manager.latest_step(), args=ocp.args.StandardRestore((progressed, weights[1:])))
         progressed, statistics = Progressed(*restored[0]), restored[1]
-        weights = Weights(fixed | progressed.networks, *statistics)
+        weights = Weights(progressed.networks, *statistics)
     update = jax.jit(update_of(model, recipe, weights), donate_argnums=(0, 1))
 
     log: dict[str, Any] = {"history": [], "dropped": 0, "stopped_early": False, "seconds": 0.0}
@@ -329,4 +310,4 @@ def train(
     manager.wait_until_finished()
     manager.close()
     log["seconds"] = time.perf_counter() - begin
-    return weights._replace(networks=fixed | networks), log
+    return weights._replace(networks=networks), log

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from larp_model.files import write_whole
 
-DRAWN = ("loss", "position", "velocity", "norm")
-COLOURS = ("#000000", "#0072B2", "#D55E00", "#9aa3ad")
+DRAWN = ("loss", "position", "norm")
+COLOURS = ("#000000", "#0072B2", "#9aa3ad")
 
 
 def history(folder: Path) -> list[dict[str, float]]:

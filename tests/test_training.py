@@ -16,7 +16,7 @@ import pytest
 from matplotlib.image import imread
 
 from larp_model import training
-from larp_model.bodies import chain, two_balls
+from larp_model.bodies import chain
 from larp_model.errors import InputError
 from larp_model.learned.model import Model
 from larp_model.learned.paper import PaperModel, Sizes
@@ -182,19 +182,3 @@ def test_importing_the_model_has_no_side_effects(tmp_path: Path) -> None:
     paths: dict[str, Any] = {"cwd": tmp_path, "env": {"PYTHONPATH": str(Path(__file__).parents[1]), "HOME": "/"}}
     result = subprocess.run([sys.executable, "-c", IMPORT], **paths, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
-
-
-def test_what_the_start_lacks_begins_fresh_and_what_it_has_goes_on() -> None:
-    scene = two_balls()
-    model = PaperModel(scene, Sizes(*[Size(2, 16)] * 3))
-    states = np.zeros((4, 3, 2, 13))
-    states[..., 3], states[:, :, 1, 0], states[..., 2] = 1.0, 0.3, 2.0
-    given = record(Truth(scene, 4), states[:, 0], np.zeros((4, 2, 0, 3)))[0]
-    windows = Windows(scene, [(given, 1.0)], dataclasses.replace(SHORT, batch=4))
-    whole = training.begun(model, windows, np.random.default_rng(0), None)
-    start = Weights(*({name: value for name, value in each.items() if "contact" not in name} for each in whole))
-    found = training.begun(model, windows, np.random.default_rng(1), start)
-    assert found.networks.keys() == whole.networks.keys() > start.networks.keys()
-    for name in start.networks:
-        assert all(jax.tree.leaves(jax.tree.map(np.array_equal, start.networks[name], found.networks[name])))
-    assert training.begun(model, windows, np.random.default_rng(1), whole) is whole
