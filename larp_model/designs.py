@@ -1,4 +1,4 @@
-"""Which models there are of a scene, and how large their networks are.
+"""Models of a scene by name, and the sizes of their networks.
 
 residual  physics of bodies and contacts, whose motion of articulated bodies a network corrects
 paper     the networks and sizes of the paper

@@ -1,4 +1,4 @@
-"""Whether and when links of two bodies meet within a step: the geometry of contacts in recorded states.
+"""Geometry of contacts in recorded states: the moment within a step at which links of two bodies meet, if any.
 
 The simulator finds its own contacts: see `physics.collision`.
 """

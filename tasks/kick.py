@@ -228,7 +228,7 @@ def main(
     if reference is not None:
         tasks["embedded"] = lambda: Kick.standard(None, height, mass, body, self_contact)
     models = (dynamics, *(each for each in get_args(DynamicsName) if each != dynamics))
-    choices = Choices(tasks, {called: chosen} | PRESETS, models, weights_for(kick, weights))
+    choices = Choices(tasks, {called: chosen} | PRESETS, models, weights_for(weights))
     with LivePage(host, port, choices.offer(kick), allow_host) as page:
         tell(f"watch it at {page.address} (Ctrl-C ends)")
         Live(page, choices, goal, out / "kept", seed, wished, finished).serve("kick")

@@ -63,10 +63,9 @@ class Choices(NamedTuple):
         return Offer(*names, terms, TARGETS, SPOTS, ROLLS)
 
 
-def weights_for(task: Task, chosen: Path | None) -> dict[str, Path | None]:
-    """Return the weights that may be chosen, by name, the usual ones first: the task's or others, and none."""
-    usual = chosen or task.weights
-    return ({} if usual is None else {usual.stem: usual}) | {NO_WEIGHTS: None}
+def weights_for(chosen: Path | None) -> dict[str, Path | None]:
+    """Return the weights that may be chosen, by name: those given, if any, and none."""
+    return ({} if chosen is None else {chosen.stem: chosen}) | {NO_WEIGHTS: None}
 
 
 class Pushed:

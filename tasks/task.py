@@ -78,15 +78,9 @@ class Task(ABC):
 
     name: str
 
-    def __init__(
-        self, scene: Scene, reference: Reference, substeps: int = FINE_SUBSTEPS, weights: Path | None = None
-    ) -> None:
-        """scene: its first body is the human, its last the ball. substeps: engine steps of the truth in a step.
-
-        weights: manifest of the model's; nothing is learned by default.
-        """
+    def __init__(self, scene: Scene, reference: Reference, substeps: int = FINE_SUBSTEPS) -> None:
+        """scene: its first body is the human, its last the ball. substeps: engine steps of the truth in a step."""
         self.scene, self.reference, self.substeps = scene, reference, substeps
-        self.weights = weights
         self.human = scene.rows(scene.bodies[0].name)
         self.ball = len(scene.links) - 1
         self.foot = scene.index(scene.bodies[0].name, "right_foot")
@@ -261,7 +255,7 @@ class Task(ABC):
         weights: str | Path | None = None,
     ) -> tuple[Planners, str]:
         """A preset's planners, made once, and the name of their weights; see `to`."""
-        manifest = self.weights if weights is None else Path(weights)
+        manifest = None if weights is None else Path(weights)
         key = (preset, dynamics if isinstance(dynamics, str) else id(dynamics), manifest)
         if key not in self._planners:
             chosen = preset_of(preset) if isinstance(preset, str) else preset
@@ -271,7 +265,7 @@ class Task(ABC):
 
     def models(self, dynamics: DynamicsName | Dynamics = "larp", weights: str | Path | None = None) -> Models:
         """The models to plan with, made once; see `to`."""
-        manifest = self.weights if weights is None else Path(weights)
+        manifest = None if weights is None else Path(weights)
         key = (dynamics if isinstance(dynamics, str) else id(dynamics), manifest)
         if key not in self._models:
             if isinstance(dynamics, str):
@@ -314,7 +308,7 @@ class Task(ABC):
 
         goal: of a kick, the target (3,) [m]. preset: its name, or one of your own. dynamics: the planner's model, by
         name or your own of the whole scene; what keeps the human up afterwards has ours. weights: manifest of the
-        model's; the task's own by default. seed: of the planner's random numbers. state: (L, 13) to
+        model's; none by default. seed: of the planner's random numbers. state: (L, 13) to
         begin in; see `start`. observe: called after every step. Of later runs with the same preset, dynamics and
         weights nothing is compiled again.
         """

@@ -117,7 +117,7 @@ def main(
         episodes: random truth episodes.
         effort: multiplies the updates of every stage.
         seed: of the data and the training; the benchmarks use seeds below 100.
-        start: manifest of weights of the same model to go on from: stages that they have been through are left out.
+        start: manifest of weights of the same model to go on from.
     """
     console, chosen = Console(), scenario(scene)
     folder = folder or trained_at(chosen.name, None if design == "residual" else design, size)
@@ -147,15 +147,12 @@ def main(
             raise InputError(f"from is {str(start)!r}, but holds weights of another model")
         rounds = content["recipe"]["rounds"]
         sizes = np.concatenate([sizes, stored.extremes(content, chosen.scene)])
-    done = {each["stage"] for each in rounds}
 
     def save(into: Path, recipe: dict[str, Any]) -> Path:
         assert learned is not None
         return stored.save(into, chosen.name, model, learned, recipe, sizes)
 
     for number, stage in enumerate(stages):
-        if stage.name in done:
-            continue
         manifest = folder / stage.name / f"{chosen.name}.json"
         if manifest.exists():
             _, learned, content = stored.load(manifest, chosen.scene)

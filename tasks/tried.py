@@ -1,4 +1,4 @@
-"""What the planner tries on the way to kicks, with the truth as its model: motions that weights must know well."""
+"""Episodes of the planner's candidates on the way to kicks, with the truth as its model."""
 
 from __future__ import annotations
 

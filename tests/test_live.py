@@ -33,7 +33,7 @@ def kick() -> Kick:
 
 @pytest.fixture
 def page(kick: Kick) -> Iterator[LivePage]:
-    choices = Choices({"embedded": lambda: kick}, PRESETS, ("larp", "mujoco"), weights_for(kick, None))
+    choices = Choices({"embedded": lambda: kick}, PRESETS, ("larp", "mujoco"), weights_for(None))
     with LivePage(port=0, offer=choices.offer(kick)) as page:
         page.begin(kick.scene, np.array([4.0, 0.0, 0.5]), state=kick.start())
         yield page
@@ -107,9 +107,9 @@ def test_a_push_changes_the_velocity_of_its_body_alone(kick: Kick) -> None:
     assert abs(apart[:-1]).max() < 1e-6 and not pushed.waiting
 
 
-def test_weights_that_are_chosen_come_first_and_none_can_be_had(kick: Kick) -> None:
-    assert weights_for(kick, None) == {"none": None}
-    assert list(weights_for(kick, Path("runs/adapt/adapted.json"))) == ["adapted", "none"]
+def test_weights_that_are_chosen_come_first_and_none_can_be_had() -> None:
+    assert weights_for(None) == {"none": None}
+    assert list(weights_for(Path("runs/adapt/adapted.json"))) == ["adapted", "none"]
 
 
 def test_a_kept_kick_of_another_scene_or_damaged_is_refused(kick: Kick, tmp_path: Path) -> None:

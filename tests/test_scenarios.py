@@ -129,6 +129,10 @@ def test_a_scene_becomes_weights_and_scores(
     assert found["launch"] == {}
     assert found["us_per_step"]["2"] > 0.0
     assert (tmp_path / "model.png").stat().st_size > 1000
+    if design == "residual":
+        train.main("chain4", folder=tmp_path / "on", episodes=64, effort=1e-4, seed=7, start=manifest)
+        on = stored.load(tmp_path / "on/weights/chain4.json")
+        assert [each["stage"] for each in on[2]["recipe"]["rounds"]] == ["steps", "steps"], "it was trained again"
 
 
 def test_training_goes_on_from_weights_of_the_same_model_alone(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What ships, physics with nothing learned, against the truth: of any scene, for short and for long."""
+"""Physics with nothing learned, as it ships, against the truth: of any scene, for short and for long."""
 
 from __future__ import annotations
 

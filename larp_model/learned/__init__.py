@@ -1,1 +1,1 @@
-"""What is learned: networks that correct physics, and the paper's."""
+"""Models with networks: physics that they correct, and the paper's."""

@@ -1,4 +1,4 @@
-"""A model of a scene: how its state moves on in a step, and which networks that needs."""
+"""The interface of a model of a scene: its step in time, and the networks that the step needs."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Model(Protocol):
         """Return the same model of a scene of bodies of the same kinds, or of some of them."""
 
     def networks(self) -> dict[str, Perceptron]:
-        """Return the networks by name; bodies of one kind share theirs, which `bodies_of` tells by the name."""
+        """Return the networks by name, see `network_name`; bodies of one kind share theirs."""
 
     def step(
         self, weights: Weights, state: Array, control: Array, torque: Array, morphology: Array, stop_gradient: bool

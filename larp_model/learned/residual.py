@@ -72,11 +72,11 @@ class ResidualModel:
         outputs = weights.outputs[name].restore(self.answer(weights, name, inputs))
         vectors = rotation.about_z(outputs.reshape(len(inputs), -1, 3), turn[:, None])
         # Of a shorter step it is that share.
-        changes = dt / self.scene.dt * vectors.reshape(len(inputs), 4, -1, 3)
-        velocity, spin = changes[:, 0], changes[:, 1]
+        added = dt / self.scene.dt * vectors.reshape(len(inputs), 4, -1, 3)
+        velocity, spin = added[:, 0], added[:, 1]
         return BodyMotion(
             motion.velocity + velocity, motion.spin + spin,
-            motion.moved + 0.5 * dt * velocity + changes[:, 2], motion.turned + 0.5 * dt * spin + changes[:, 3],
+            motion.moved + 0.5 * dt * velocity + added[:, 2], motion.turned + 0.5 * dt * spin + added[:, 3],
         )  # fmt: skip
 
     def measure(self, before: Array, after: Array, control: Array, torque: Array, morphology: Array) -> Measured:

@@ -155,7 +155,7 @@ def main(
     random = np.random.default_rng(seed)
     targets = [random_task(random)[0] for _ in range(kicks)]
     kick = Kick.standard()
-    choices = Choices({"embedded": lambda: kick}, {preset: PRESETS[preset]}, ("larp",), weights_for(kick, None))
+    choices = Choices({"embedded": lambda: kick}, {preset: PRESETS[preset]}, ("larp",), weights_for(None))
     process, begun = psutil.Process(), time.monotonic()
     kick.to(USUAL, preset)  # what plans and steps keeps its threads
     before = process.num_threads()
