@@ -21,7 +21,7 @@ from mpc import CEM
 from tasks.kick import Kick, wished
 from tasks.live import Choices, Live
 from tasks.presets import Preset
-from viewer import LivePage, Wishes
+from viewer import LivePage, Wishes, write_html
 from viewer.camera import VIEWS
 
 if TYPE_CHECKING:
@@ -181,6 +181,18 @@ def test_the_page_is_not_blank_and_has_human_and_target_in_its_picture(
     blue = picture[..., 2] > picture[..., 0] + 0.15
     assert (np.ptp(picture, axis=-1) > 0.3).mean() > 0.002, "nothing coloured is on the page"
     assert green.any() and blue.any()
+
+
+def test_replay_runs_from_its_file_alone(played: Page, browser: Browser, served: Served, tmp_path: Path) -> None:
+    assert served.page.recording is not None
+    write_html(served.page.recording, tmp_path / "kick.html")
+    page = browser.new_page(viewport={"width": SMALL[0], "height": SMALL[1]})
+    errors: list[str] = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.goto((tmp_path / "kick.html").as_uri())
+    until(lambda: (np.ptp(pixels(page, tmp_path / "page.png"), axis=-1) > 0.3).mean() > 0.001)  # coloured, not blank
+    page.close()
+    assert not errors
 
 
 def test_a_key_kicks_and_the_ball_moves(seen: Page, served: Served, tmp_path: Path) -> None:
