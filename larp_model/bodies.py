@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import numpy as np
 
@@ -97,6 +97,26 @@ def detail_of(body: Body) -> Detail:
         if body.kind == kind:
             return detail
     raise InputError(f"body {body.name!r} is a {body.kind}, but must be one of {', '.join(KINDS.values())}")
+
+
+def usual(body: Body) -> Body:
+    """Return the human of usual size of which this one is another size (see `Body.sized`); other bodies as they are."""
+    if body.kind not in KINDS.values():
+        return body
+    same = replace(_usual_human(body.name, detail_of(body)), surface=body.surface)
+    resized = same.sized(body.sizes)
+    if resized.links != body.links or _without_motors(resized) != _without_motors(body):
+        return body
+    one, other = _motor_values(resized), _motor_values(body)
+    return same if one.shape == other.shape and np.allclose(one, other, rtol=1e-9, atol=0.0) else body
+
+
+def _motor_values(body: Body) -> np.ndarray:
+    return np.array([np.concatenate([np.ravel(part) for part in astuple(motor)]) for _, _, motor in body.motors])
+
+
+def _without_motors(body: Body) -> tuple[Joint, ...]:
+    return tuple(replace(joint, motor=None) for joint in body.joints)
 
 
 def _usual_human(name: str, detail: Detail) -> Body:

@@ -76,13 +76,12 @@ def novelty(simulator: Simulator, states: np.ndarray, controls: np.ndarray) -> f
     training data, over which it is 1; of the body that is furthest from its own. Contacts are left out: where links
     are apart their networks see anything, and are not heard.
     """
-    given = (jnp.asarray(each, jnp.float32) for each in (states[:-1], states[1:], controls))
+    given = (jnp.asarray(each, jnp.float32) for each in (states[:-1], states[1:], controls, simulator.morphology[None]))
     return float(_novelty(simulator.model, simulator.weights, *given))
 
 
 @partial(jax.jit, static_argnums=0)
-def _novelty(model: Model, weights: Weights, before: Array, after: Array, controls: Array) -> Array:
-    sizes = kinematics.morphology_of(model.scene)[None]
+def _novelty(model: Model, weights: Weights, before: Array, after: Array, controls: Array, sizes: Array) -> Array:
     seen = model.measure(before, after, controls, jnp.zeros((*before.shape[:2], 3)), sizes)
     names = [name for name in model.networks() if name.startswith("dynamics/")]
     return jnp.stack([weights.inputs[name].novelty(seen[name][0]) for name in sorted(names)]).max()

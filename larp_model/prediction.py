@@ -41,4 +41,4 @@ def _roll(
     model: Model, weights: Weights, start: Array, targets: Array, pushes: Array, sizes: Array, steps: Array
 ) -> Array:
     """Compiled once for all weights of a model."""
-    return Simulator(model, weights).rollout(start, targets, torques=pushes, morphology=sizes, steps=steps)
+    return Simulator.of(model, weights).rollout(start, targets, torques=pushes, morphology=sizes, steps=steps)

@@ -5,7 +5,8 @@ After M. Andriluka et al., "Learned neural physics simulation for articulated 3D
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -16,6 +17,7 @@ from jax.typing import ArrayLike, DTypeLike
 
 from larp_model import state as packed
 from larp_model import weights as stored
+from larp_model.bodies import usual
 from larp_model.errors import InputError
 from larp_model.kinematics import morphology_of
 from larp_model.learned.model import Model
@@ -39,14 +41,28 @@ def step(
     return model.step(weights, state, control, torque, sizes, stop_gradient)
 
 
+@partial(jax.tree_util.register_dataclass, data_fields=["weights", "morphology"], meta_fields=["model", "scene"])
 @dataclass(frozen=True, eq=False)
 class Simulator:
-    """A model of a scene, with its weights: pure, jit-able, batched, differentiable."""
+    """A model of a scene, with its weights: pure, jit-able, batched, differentiable.
+
+    A pytree, whose leaves are weights and sizes: scenes that differ in sizes of humans alone share what is compiled.
+    """
 
     model: Model
     weights: Weights
+    scene: Scene
+    morphology: Array | np.ndarray
+    """Of the scene, (L, 3)."""
 
     differentiable = True
+
+    @staticmethod
+    def of(model: Model, weights: Weights) -> Simulator:
+        """Return the simulator of a model; of humans, that of humans of usual size is given their sizes."""
+        scene = model.scene
+        shared = replace(scene, bodies=tuple(usual(body) for body in scene.bodies))
+        return Simulator(model.on(shared), weights, scene, scene.morphology)
 
     @property
     def side_by_side(self) -> int:
@@ -61,18 +77,13 @@ class Simulator:
         process to the next: see `runtime.remember_compilations`.
         """
         remember_compilations()
-        return Simulator(*stored.load(Path(weights), scene)[:2])
+        return Simulator.of(*stored.load(Path(weights), scene)[:2])
 
     @staticmethod
     def of_physics(scene: Scene) -> Simulator:
         """Return the simulator of any scene with nothing learned."""
         remember_compilations()
-        return Simulator(ResidualModel(scene), Weights({}, {}, {}))
-
-    @property
-    def scene(self) -> Scene:
-        """What is simulated."""
-        return self.model.scene
+        return Simulator.of(ResidualModel(scene), Weights({}, {}, {}))
 
     def step(
         self, state: ArrayLike, control: ArrayLike, torque: ArrayLike | None = None,
@@ -105,7 +116,7 @@ class Simulator:
     def _checked(
         self, state: ArrayLike, control: ArrayLike, torque: ArrayLike | None, morphology: ArrayLike | None,
         steps: tuple[int, ...],
-    ) -> tuple[Array, Array, Array | None, Array | None]:  # fmt: skip
+    ) -> tuple[Array, Array, Array | None, Array]:  # fmt: skip
         """The public arguments as JAX arrays, refused by name where they do not fit; steps: (H,) or none."""
         start, links, motors = _array("state", state), len(self.scene.links), len(self.scene.motors)
         if start.ndim != 3 or start.shape[1:] != (links, packed.SIZE):
@@ -118,8 +129,8 @@ class Simulator:
             if given[-1] is not None and given[-1].shape != (count, *steps, rows, 3):
                 wanted = f"({count}, {'H, ' if steps else ''}{rows}, 3)"
                 raise InputError(f"{name} have shape {given[-1].shape}, but need {wanted}")
-        sizes = None if morphology is None else _array("morphology", morphology, start.dtype)
-        if sizes is not None and sizes.shape not in ((1, links, 3), (count, links, 3)):
+        sizes = _array("morphology", self.morphology[None] if morphology is None else morphology, start.dtype)
+        if sizes.shape not in ((1, links, 3), (count, links, 3)):
             raise InputError(f"morphology has shape {sizes.shape}, but needs ({count} or 1, {links}, 3)")
         controls, torques = given
         assert controls is not None

@@ -6,6 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -266,7 +267,9 @@ def train(
         TextColumn("training"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"),
         TextColumn("{task.fields[note]}"), TimeRemainingColumn(),
     )  # fmt: skip
-    with Progress(*columns, disable=quiet) as bar, SummaryWriter(str(folder / "tensorboard")) as board:
+    # A checkpoint is written beside training: closing the manager, however training ends, waits for the last.
+    board_folder = str(folder / "tensorboard")
+    with closing(manager), Progress(*columns, disable=quiet) as bar, SummaryWriter(board_folder) as board:
         task = bar.add_task("", total=recipe.updates, completed=first, note="")
         index = first
         while index < recipe.updates:
@@ -307,7 +310,5 @@ def train(
                 left = (seconds - (now - begin)) / ((now - compiled) / (TIMED - 1))
                 recipe = replace(recipe, updates=min(recipe.updates, index + max(1, int(left))))
                 bar.update(task, total=recipe.updates)
-    manager.wait_until_finished()
-    manager.close()
     log["seconds"] = time.perf_counter() - begin
     return weights._replace(networks=networks), log

@@ -21,10 +21,10 @@ from larp_model.files import write_whole
 from larp_model.learned.model import Model, blank_weights
 from larp_model.learned.paper import PaperModel, Sizes, pairs_by_kind
 from larp_model.learned.residual import ResidualModel
-from larp_model.mechanics import Constants
 from larp_model.names import require_file
 from larp_model.networks import Size, Statistics, Weights
 from larp_model.physics.collision import ContactSettings
+from larp_model.physics.motion import Constants
 from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface
 
 VERSION = 4

@@ -1,5 +1,7 @@
 """What the planner plans with: anything that rolls a batch of states out under a batch of controls."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -76,6 +78,7 @@ class MujocoDynamics:
         return result
 
 
+@jax.tree_util.register_pytree_node_class
 @dataclass(frozen=True)
 class Continued:
     """The whole scene for H steps under control, then only `links` for `steps` more, by their own model.
@@ -111,3 +114,13 @@ class Continued:
         followed = self.tail.rollout(last[:, self.links], jnp.zeros((len(state), self.steps, 0, 3)))
         frozen = jnp.repeat(last[:, None], self.steps, axis=1)
         return jnp.concatenate([states, frozen.at[:, :, self.links].set(followed)], axis=1)
+
+    def tree_flatten(self) -> tuple[tuple[Dynamics, Dynamics], tuple[int, int, int]]:
+        """Return the models, and what makes another program."""
+        return (self.dynamics, self.tail), (self.links.start, self.links.stop, self.steps)
+
+    @classmethod
+    def tree_unflatten(cls, rest: tuple[int, int, int], models: tuple[Dynamics, Dynamics]) -> Continued:
+        """Return what was flattened; the models may be anything."""
+        begin, end, steps = rest
+        return cls(*models, slice(begin, end), steps)

@@ -1,7 +1,7 @@
 """Levenberg-Marquardt on the residuals of the named costs, through the model."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -9,8 +9,9 @@ import numpy as np
 from larp_model.errors import InputError
 from mpc.search import COLOUR, Problem, Residuals, Search, Tried, coloured_noise, merged
 
-# Dampings of a round, tried side by side, as multiples of the last one that served best.
+# Dampings of a round, tried side by side, as multiples of the last one that served best; it is expected to do so again.
 FACTORS = np.array([1e-2, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0, 1000.0])
+EXPECTED = 3
 # A step that gains more, or less, of what its quadratic promises divides, or multiplies, the next damping, down to a
 # floor; where no step gains anything it is ten times as large.
 GOOD, BAD, CHANGE, FAILED, FLOOR = 0.75, 0.25, 3.0, 10.0, 1e-6
@@ -18,11 +19,24 @@ GOOD, BAD, CHANGE, FAILED, FLOOR = 0.75, 0.25, 3.0, 10.0, 1e-6
 LONGEST = 3.0
 
 
-class Slopes(NamedTuple):
+class Linearization(NamedTuple):
+    """Residuals around knots, taken as linear along directions from them."""
+
+    knots: np.ndarray  # (K, J, 3)
+    here: Tried  # what they came to, N = 1
+    directions: np.ndarray  # (D, K, J, 3)
+    there: Tried  # what their neighbours came to, N = D, or none where derivatives are not differences
+
+
+class Quadratic(NamedTuple):
     """The cost as a quadratic of D coordinates a, around a = 0: gradient . a + a . curvature a / 2."""
 
     gradient: np.ndarray  # (D,)
     curvature: np.ndarray  # (D, D)
+
+    def gain(self, coordinates: np.ndarray) -> float:
+        """Return what coordinates (D,) take off the cost."""
+        return float(-self.gradient @ coordinates - 0.5 * coordinates @ self.curvature @ coordinates)
 
 
 @dataclass(frozen=True)
@@ -37,8 +51,7 @@ class GaussNewton:
 
     `FACTORS` dampings are solved for and tried side by side, and the cheapest wins if it is cheaper than where it came
     from. J comes from forward derivatives of the rollout (`forward`), or from differences of `step` spreads, which any
-    dynamics have and which see the same candidates' programs (`differences`). Reverse derivatives of a kick would give
-    the three rows of its miss along all axes for the price of some thirty forward ones, but compile for 40 s.
+    dynamics have and which see the same candidates' programs (`differences`): R rounds try R + 1 batches.
     """
 
     rounds: int = 3
@@ -75,90 +88,91 @@ class GaussNewton:
         return search
 
     def refine(self, knots: np.ndarray, search: Search, random: np.random.Generator, problem: Problem) -> Search:
-        """All rounds from knots (K, J, 3) on; every step that was tried may become an elite."""
-        here, damping = None, self.damping
-        for _ in range(self.rounds):
-            noise = coloured_noise(random, (self.directions, *knots.shape), self.exponent)
-            directions, there = search.spread * noise, None
-            if here is None:  # the start and its neighbours are rolled out side by side
-                together = np.concatenate([knots[None], self.neighbours(knots, directions)])
-                tried = problem.tries(together)
-                search = merged(search, together, tried.costs)
-                here, there = tried.row(0), tried.rows(slice(1, None))
-            if not np.isfinite(here.costs[0]):  # no slope where nothing comes back: look around
-                tried = problem.tries(knots + directions)
-                search = merged(search, knots + directions, tried.costs)
-                best = int(np.argmin(tried.costs))
-                if np.isfinite(tried.costs[best]):
-                    knots, here = knots + directions[best], tried.row(best)
-                continue
-            search, derivatives = self.derivatives(knots, here, directions, search, problem, there)
-            slopes = quadratic(here, derivatives)
-            steps, coordinates, dampings = self.steps(slopes, damping, directions, search.scale)
+        """All rounds from knots (K, J, 3) on; every step that was tried may become an elite.
+
+        The neighbours that a round takes differences to are tried with the steps of the round before, when none of them
+        has won yet: around the step that is expected to, or around where the steps came from if no step of the last
+        round was any good. The winner's residuals are then taken to fall as those there do.
+        """
+        directions = self.drawn(search, random)
+        begun = np.concatenate([knots[None], self.neighbours(knots, directions)])
+        tried = problem.tries(begun)
+        search, here = merged(search, begun, tried.costs), tried.row(0)
+        if not np.isfinite(here.costs[0]):
+            return self.look_around(knots, search, random, problem)
+        linearization = Linearization(knots, here, directions, tried.rows(slice(1, None)))
+        damping, missed = self.damping, False
+        for number in range(self.rounds):
+            model = quadratic(here, self.derivatives(linearization, problem))
+            steps, coordinates, dampings = self.steps(model, damping, linearization.directions, search.scale)
             if not len(steps):
                 break
-            tried = problem.tries(knots + steps)
-            search = merged(search, knots + steps, tried.costs)
-            best = int(np.argmin(tried.costs))
+            directions = self.drawn(search, random)
+            ahead = knots if missed else knots + steps[EXPECTED]
+            neighbours = self.neighbours(ahead, directions)[: 0 if number + 1 == self.rounds else None]
+            together = np.concatenate([knots + steps, neighbours])
+            tried = problem.tries(together)
+            search, best = merged(search, together, tried.costs), int(np.argmin(tried.costs[: len(steps)]))
+            there, expected = tried.rows(slice(len(steps), None)), here if missed else tried.row(EXPECTED)
             gained = float(here.costs[0] - tried.costs[best])
-            a = coordinates[best]
-            promised = float(-slopes.gradient @ a - 0.5 * a @ slopes.curvature @ a)
-            if not gained > 0.0:
+            if (missed or gained > 0.0) and np.isfinite(expected.costs[0]):
+                linearization = Linearization(ahead, expected, directions, there)
+            missed = not gained > 0.0
+            if missed:
                 damping *= FAILED
-                continue
-            damping = dampings[best]
-            if gained < BAD * promised:
-                damping *= CHANGE
-            elif gained > GOOD * promised:
-                damping = max(damping / CHANGE, FLOOR)
-            knots = knots + steps[best]
-            here = tried.row(best)
+            else:
+                knots, here = knots + steps[best], tried.row(best)
+                promised = model.gain(coordinates[best])
+                damping = dampings[best] * (CHANGE if gained < BAD * promised else 1.0)
+                damping = max(damping / CHANGE, FLOOR) if gained > GOOD * promised else damping
+            if self.differentiates:
+                linearization = Linearization(knots, here, directions, there)
         return search
+
+    def look_around(self, knots: np.ndarray, search: Search, random: np.random.Generator, problem: Problem) -> Search:
+        """Refine the best candidate around knots whose own rollout is lost, so that nothing is linear there."""
+        for left in reversed(range(self.rounds)):
+            around = knots + self.drawn(search, random)
+            tried = problem.tries(around)
+            search, best = merged(search, around, tried.costs), int(np.argmin(tried.costs))
+            if np.isfinite(tried.costs[best]):
+                return replace(self, rounds=left).refine(around[best], search, random, problem) if left else search
+        return search
+
+    def drawn(self, search: Search, random: np.random.Generator) -> np.ndarray:
+        """Return the directions (D, K, J, 3) [rad] of a round."""
+        return search.spread * coloured_noise(random, (self.directions, *search.mean.shape), self.exponent)
 
     def neighbours(self, knots: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Return the knots (D, K, J, 3) that differences are taken to, none (0, K, J, 3) where they are not taken."""
-        return knots + self.step * (directions if self.jacobian == "differences" else directions[:0])
+        return knots + self.step * (directions[:0] if self.differentiates else directions)
 
-    def derivatives(
-        self,
-        knots: np.ndarray,
-        here: Tried,
-        directions: np.ndarray,
-        search: Search,
-        problem: Problem,
-        there: Tried | None = None,
-    ) -> tuple[Search, Residuals]:
-        """Return those of the residuals along the directions, (D, ...) by term; zero where they are not finite.
-
-        there: what the neighbours came to, if they are tried already. They may become elites.
-        """
-        usable = np.ones(len(directions), bool)
-        if self.jacobian == "forward":
-            found = problem.tangents(knots, directions)
+    def derivatives(self, linearization: Linearization, problem: Problem) -> Residuals:
+        """Return those of the residuals along the directions, (D, ...) by term; zero where they are not finite."""
+        count = len(linearization.directions)
+        if self.differentiates:
+            found, usable = problem.tangents(linearization.knots, linearization.directions), np.ones(count, bool)
         else:
-            if there is None:
-                neighbours = self.neighbours(knots, directions)
-                there = problem.tries(neighbours)
-                search = merged(search, neighbours, there.costs)
-            found = {name: (each - here.residuals[name]) / self.step for name, each in there.residuals.items()}
+            at, there = linearization.here.residuals, linearization.there
+            found = {name: (each - at[name]) / self.step for name, each in there.residuals.items()}
             usable = np.isfinite(there.costs)  # the residuals of what is lost may be anything
         usable &= np.all([np.isfinite(_flat(each)).all(axis=1) for each in found.values()], axis=0)
-        if self.jacobian == "forward":
+        if self.differentiates:
             problem.lost(int((~usable).sum()))
-        return search, {name: np.where(usable.reshape(-1, *(1,) * (r.ndim - 1)), r, 0.0) for name, r in found.items()}
+        return {name: np.where(usable.reshape(-1, *(1,) * (r.ndim - 1)), r, 0.0) for name, r in found.items()}
 
     def steps(
-        self, slopes: Slopes, damping: float, directions: np.ndarray, scale: np.ndarray
+        self, model: Quadratic, damping: float, directions: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Steps (S, K, J, 3) [rad], their coordinates (S, D) and dampings (S,); none where nothing has a slope."""
-        mean = np.trace(slopes.curvature) / len(slopes.gradient)
+        mean = np.trace(model.curvature) / len(model.gradient)
         none = directions[:0], np.zeros((0, len(directions))), np.zeros(0)
-        if not (np.isfinite(slopes.gradient).all() and 0.0 < mean < np.inf):
+        if not (np.isfinite(model.gradient).all() and 0.0 < mean < np.inf):
             return none
         dampings = damping * FACTORS
         # One decomposition serves all dampings.
-        value, vector = np.linalg.eigh(slopes.curvature)
-        along = vector.T @ slopes.gradient
+        value, vector = np.linalg.eigh(model.curvature)
+        along = vector.T @ model.gradient
         coordinates = -(along / (np.maximum(value, 0.0) + dampings[:, None] * mean)) @ vector.T
         steps = np.einsum("sd,dkjx->skjx", coordinates.astype(np.float32), directions)
         moving = scale > 0.0
@@ -169,13 +183,13 @@ class GaussNewton:
         return steps * share[:, None, None, None].astype(np.float32), coordinates * share[:, None], dampings
 
 
-def quadratic(here: Tried, derivatives: Residuals) -> Slopes:
+def quadratic(here: Tried, derivatives: Residuals) -> Quadratic:
     """The cost around one candidate, whose residuals are (1, ...), along derivatives (D, ...) of them."""
     slopes = [
         (_flat(derivatives[name]).astype(float), _flat(here.residuals[name])[0], _flat(here.curvatures[name])[0])
         for name in derivatives
     ]
-    return Slopes(
+    return Quadratic(
         np.sum([jacobian @ (weight * residual) for jacobian, residual, weight in slopes], axis=0),
         np.sum([(jacobian * weight) @ jacobian.T for jacobian, _, weight in slopes], axis=0),
     )

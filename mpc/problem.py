@@ -70,22 +70,24 @@ class Equations:
 
         return jax.vmap(one)(states, controls)
 
-    def gradients(self, wanted: Wanted, knots: jax.Array, corrections: Any) -> tuple[jax.Array, Any, jax.Array]:
+    def gradients(
+        self, dynamics: Dynamics, wanted: Wanted, knots: jax.Array, corrections: Any
+    ) -> tuple[jax.Array, Any, jax.Array]:
         """Gradients (N, K, J, 3) of the costs of knots (N, K, J, 3), what `weigh` finds, and the states."""
 
         def summed(knots: jax.Array) -> tuple[jax.Array, Any]:
-            states, controls = self.roll_out(self.dynamics, wanted, knots)
+            states, controls = self.roll_out(dynamics, wanted, knots)
             tried = self.weigh(wanted, states, controls, corrections)
             return jnp.sum(tried[0]), (tried, states)
 
         gradient, (tried, states) = jax.grad(summed, has_aux=True)(knots)
         return gradient, tried, states
 
-    def tangents(self, wanted: Wanted, knots: jax.Array, directions: jax.Array) -> Any:
+    def tangents(self, dynamics: Dynamics, wanted: Wanted, knots: jax.Array, directions: jax.Array) -> Any:
         """Derivatives (D, ...) of the residuals at knots (K, J, 3) along directions (D, K, J, 3)."""
 
         def found(knots: jax.Array) -> Any:
-            states, controls = (leaf[0] for leaf in self.roll_out(self.dynamics, wanted, knots[None]))
+            states, controls = (leaf[0] for leaf in self.roll_out(dynamics, wanted, knots[None]))
             return residuals(self.terms, states, controls, wanted.context)
 
         return jax.vmap(lambda direction: jax.jvp(found, (knots,), (direction,))[1])(directions)
@@ -138,9 +140,13 @@ class PlannerProblem:
     carried: np.ndarray
     corrections: Residuals = field(default_factory=dict)
     record: Record = field(default_factory=Record)
+    known: dict[bytes, Tried] = field(default_factory=dict)
+    """Results of the best candidate of each batch, by its knots."""
 
     def tries(self, knots: np.ndarray) -> Tried:
         """See `search.Problem`."""
+        if len(knots) == 1 and (known := self.known.get(knots.tobytes())):
+            return known
         dynamics = self.equations.dynamics
         size = side_by_side(dynamics)
         few = len(knots) <= (max(FEW, size) if jax.default_backend() == "cpu" else size)
@@ -148,13 +154,14 @@ class PlannerProblem:
 
     def gradients(self, knots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """See `search.Problem`."""
-        arguments = self.wanted, knots, self.corrections
-        gradient, tried, states = self.run("gradients", self.equations.gradients, *arguments)
+        function, arguments = called(self.equations.gradients, self.equations.dynamics)
+        gradient, tried, states = self.run("gradients", function, *arguments, self.wanted, knots, self.corrections)
         return self._recorded(knots, tried, states).costs, np.asarray(gradient)
 
     def tangents(self, knots: np.ndarray, directions: np.ndarray) -> Residuals:
         """See `search.Problem`."""
-        found = self.run("tangents", self.equations.tangents, self.wanted, knots, directions)
+        function, arguments = called(self.equations.tangents, self.equations.dynamics)
+        found = self.run("tangents", function, *arguments, self.wanted, knots, directions)
         return {name: np.asarray(each) for name, each in found.items()}
 
     def lost(self, count: int) -> None:
@@ -165,12 +172,12 @@ class PlannerProblem:
     def trials(self, dynamics: Dynamics, knots: np.ndarray) -> Tried:
         """See `search.Problem`."""
         self.record.verified += len(knots)
-        apart = replace(self, corrections={}, record=Record(self.record.costs))
+        apart = replace(self, corrections={}, record=Record(self.record.costs), known={})
         return apart._tries(dynamics, knots, len(knots))
 
     def corrected(self, corrections: Residuals) -> PlannerProblem:
         """See `search.Problem`."""
-        return replace(self, corrections={name: each[0] for name, each in corrections.items()})
+        return replace(self, corrections={name: each[0] for name, each in corrections.items()}, known={})
 
     def states_of(self, knots: np.ndarray) -> np.ndarray:
         """What the dynamics make of knots (K, J, 3): states (H', L, 13)."""
@@ -195,10 +202,10 @@ class PlannerProblem:
     def _rolled(self, dynamics: Dynamics, knots: np.ndarray, size: int) -> tuple[Any, Any]:
         """What `weigh` finds of knots, and their states: `size` at a time, the last ones filled up."""
         name, found = ("roll out", id(dynamics)), []
+        roll_out, arguments = called(self.equations.roll_out, dynamics)
         for begin in range(0, len(knots), size):
             rows = np.minimum(np.arange(begin, begin + size), len(knots) - 1)
-            roll_out = partial(self.equations.roll_out, dynamics)
-            states, controls = self.run(name, roll_out, self.wanted, knots[rows])
+            states, controls = self.run(name, roll_out, *arguments, self.wanted, knots[rows])
             tried = self.run("weigh", self.equations.weigh, self.wanted, states, controls, self.corrections)
             found.append((tried, states))
         if len(knots) == size:
@@ -209,5 +216,15 @@ class PlannerProblem:
         found = Tried(*jax.tree.map(np.asarray, tried))
         self.record.costs.append(found.costs)
         best = int(np.argmin(found.costs))
-        self.record.best[knots[best].tobytes()] = np.asarray(states)[best].copy()
+        key = knots[best].tobytes()
+        self.record.best[key], self.known[key] = np.asarray(states)[best].copy(), found.row(best)
         return found
+
+
+def called(function: Callable[..., Any], dynamics: Dynamics) -> tuple[Callable[..., Any], tuple[Dynamics, ...]]:
+    """Return what to compile of a function whose first argument are dynamics, and the arguments that come first.
+
+    Dynamics that are a pytree of arrays are an argument: others of the same structure then need not be compiled again.
+    """
+    traced = all(isinstance(leaf, jax.Array | np.ndarray) for leaf in jax.tree.leaves(dynamics))
+    return (function, (dynamics,)) if traced else (partial(function, dynamics), ())

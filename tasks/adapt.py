@@ -65,7 +65,7 @@ class Checked(NamedTuple):
 
 def check(model: Model, weights: Weights, episodes: Episodes) -> Checked:
     """What weights are worth; infinite where all predictions diverge."""
-    found = evaluation.evaluate(Simulator(model, weights), episodes, WINDOWS)
+    found = evaluation.evaluate(Simulator.of(model, weights), episodes, WINDOWS)
     human = tuple(math.inf if (error := found["windows"][str(n)]["human"]) is None else error for n in WINDOWS)
     return Checked(human, found["launch"]["0"].get("relative_error", {}).get("median", math.nan))
 

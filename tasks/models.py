@@ -65,7 +65,7 @@ def models_of(
     if weights is None:
         return _continued(scene, [Simulator.of_physics(part) for part in parts], False, NO_WEIGHTS)
     model, learned, manifest = stored.load(weights, scene)
-    simulators = [Simulator(model.on(part), learned) for part in parts]
+    simulators = [Simulator.of(model.on(part), learned) for part in parts]
     return _continued(scene, simulators, False, manifest["sha256"][:12])
 
 

@@ -179,7 +179,7 @@ def main(
         console.print(f"{stage.name}: {log['seconds']:.0f} s, {log['dropped']} batches dropped")
     assert learned is not None
     held_out, _ = chosen.draw(256, EVALUATION_SEED)
-    scores = evaluation.evaluate(Simulator(model, learned), held_out, chosen.windows)
+    scores = evaluation.evaluate(Simulator.of(model, learned), held_out, chosen.windows)
     recipe_of = {
         "rounds": rounds,
         "truth": {"engine": "mujoco", "substeps": SUBSTEPS, "dt": chosen.scene.dt},

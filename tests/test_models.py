@@ -18,10 +18,10 @@ from larp_model.kinematics import morphology_of
 from larp_model.learned.model import Model, initial_weights
 from larp_model.learned.paper import PaperModel, Sizes
 from larp_model.learned.residual import ResidualModel, changes, true_motion
-from larp_model.mechanics import BodyMotion
 from larp_model.meeting import first_contacts
 from larp_model.networks import Size, Weights
 from larp_model.physics.collision import ContactSettings
+from larp_model.physics.motion import BodyMotion, Constants
 from larp_model.scene import Scene
 from larp_model.simulator import step
 from larp_model.truth.episodes import Episodes
@@ -60,10 +60,10 @@ def chains() -> Episodes:
 
 
 def made(name: str, scene: Scene) -> Model:
-    """Return a model whose contacts are solved until nothing is left to solve, and so have the law's derivatives."""
+    """Return a model whose impulses are solved for until nothing is left, and so have the law's derivatives."""
     if name == "paper":
         return PaperModel(scene, Sizes(LEAST, LEAST, LEAST))
-    return ResidualModel(scene, LEAST, contacts=ContactSettings(iterations=40))
+    return ResidualModel(scene, LEAST, Constants(iterations=40), ContactSettings(iterations=40))
 
 
 @pytest.fixture(scope="module", params=CASES, ids="-".join)

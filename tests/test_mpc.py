@@ -31,6 +31,7 @@ from mpc import (
     shift,
 )
 from mpc.cost import curvatures
+from mpc.gauss_newton import Linearization
 from mpc.search import Search, Tried, coloured_noise, distinct, merged
 
 HORIZON, KNOTS, DT = 12, 4, 0.01
@@ -524,7 +525,8 @@ def test_one_step_of_gauss_newton_solves_what_is_linear(jacobian: str) -> None:
     assert np.abs(plan.knots).max() < 1.0
 
 
-def test_a_round_of_differences_asks_for_two_rollouts() -> None:
+@pytest.mark.parametrize("rounds", [1, 3])
+def test_rounds_of_differences_ask_for_one_rollout_each_and_one_at_first(rounds: int) -> None:
     class Bowl(Ripples):
         def tries(self, knots: np.ndarray) -> Tried:
             found, flat = super().tries(knots), knots.reshape(len(knots), -1)
@@ -532,8 +534,9 @@ def test_a_round_of_differences_asks_for_two_rollouts() -> None:
 
     problem, search = Bowl(), _search()
     start = search.elites[0]
-    better = GaussNewton(rounds=1).refine(start, search, np.random.default_rng(0), problem)  # type: ignore[arg-type]
-    assert problem.counted == 2 and better.costs[0] < problem.cost(start[None])[0]
+    steps = GaussNewton(rounds=rounds, directions=3)
+    better = steps.refine(start, search, np.random.default_rng(0), problem)  # type: ignore[arg-type]
+    assert problem.counted == 1 + rounds and better.costs[0] < problem.cost(start[None])[0]
 
 
 def test_few_candidates_are_rolled_out_as_many_at_a_time_as_the_dynamics_say() -> None:
@@ -593,10 +596,9 @@ def test_differences_take_nothing_from_candidates_that_are_lost() -> None:
             return Tried(np.array([0.5, np.inf], np.float32), {"miss": np.array([[0.9], [0.0]])}, {})
 
     here = Tried(np.array([0.6]), {"miss": np.array([[1.0]])}, {})
-    search = _search()
-    directions = np.ones((2, KNOTS, 1, 3), np.float32)
-    newton = GaussNewton(directions=2, step=0.1)
-    _, found = newton.derivatives(search.mean, here, directions, search, Treacherous())  # type: ignore[arg-type]
+    directions, problem = np.ones((2, KNOTS, 1, 3), np.float32), Treacherous()
+    linearization = Linearization(_search().mean, here, directions, problem.tries(directions))
+    found = GaussNewton(directions=2, step=0.1).derivatives(linearization, problem)  # type: ignore[arg-type]
     np.testing.assert_allclose(found["miss"], [[-1.0], [0.0]])
 
 

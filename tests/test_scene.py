@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from larp_model import kinematics
 from larp_model.anatomy import ANATOMIES, Detail
-from larp_model.bodies import ball, capsule, chain, detail_of, human, human_and_ball, standing_height
+from larp_model.bodies import ball, capsule, chain, detail_of, human, human_and_ball, standing_height, usual
 from larp_model.errors import InputError
 from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface, anchor
 
@@ -241,6 +241,13 @@ def test_motors_are_scaled_by_name_beyond_their_proportion(detail: Detail, facto
     for (child, _, motor), (_, _, before) in zip(scaled.motors, body.motors, strict=True):
         shin = body.links[child].name.endswith("shin")
         assert motor == (before.times(factor) if shin else before)
+
+
+def test_humans_that_differ_in_sizes_alone_have_one_usual_size() -> None:
+    assert usual(human(height=1.6, mass=50.0, lengths={"foot": 1.1})) == usual(human()) == human()
+    assert usual(human(height=1.6, detail="full")) == human(detail="full")
+    stronger = human(height=1.6, motors={"foot": 2.0})
+    assert usual(stronger) == stronger and usual(ball(radius=0.2)) == ball(radius=0.2)
 
 
 def test_a_ball_is_the_only_body_without_a_direction() -> None:

@@ -65,7 +65,7 @@ def test_a_human_who_falls_lies_still_with_its_joints_closed(reference: Referenc
 def test_what_is_like_the_training_data_has_a_novelty_of_about_one(episodes: Episodes) -> None:
     model = ResidualModel(human_and_ball(), Size(2, 16))
     windows = Windows(model.scene, [(episodes, 1.0)], Recipe(batch=256, contact_share=0.0))
-    simulator = Simulator(model, statistics_of(model, windows, np.random.default_rng(0), batches=8))
+    simulator = Simulator.of(model, statistics_of(model, windows, np.random.default_rng(0), batches=8))
     usual = [evaluation.novelty(simulator, *each) for each in zip(episodes.states[:8], episodes.controls, strict=False)]
     assert 0.5 < np.median(usual) < 1.5 and max(usual) < NOVEL
     shaken = episodes.states[0].copy()

@@ -14,16 +14,18 @@ from jax import Array, export
 
 from larp_model import losses, rotation
 from larp_model import state as packed
+from larp_model.anatomy import Detail
 from larp_model.bodies import BALL_SURFACE, capsule, chain, human_and_ball
 from larp_model.errors import InputError
 from larp_model.kinematics import morphology_of
 from larp_model.learned.model import Model
+from larp_model.learned.residual import ResidualModel
 from larp_model.losses import LossWeights
 from larp_model.meeting import first_contacts
 from larp_model.networks import Size, Weights
 from larp_model.physics.ball import SUBSTEPS
 from larp_model.scene import Pair, Scene
-from larp_model.simulator import Simulator, rollout
+from larp_model.simulator import Simulator, rollout, step
 from larp_model.truth.episodes import Episodes
 
 STEPS = 10
@@ -37,12 +39,12 @@ def double_precision() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def residual_simulator(residual: Model, residual_weights: Weights) -> Simulator:
-    return Simulator(residual, residual_weights)
+    return Simulator.of(residual, residual_weights)
 
 
 @pytest.fixture(scope="module")
 def paper_simulator(paper: Model, paper_weights: Weights) -> Simulator:
-    return Simulator(paper, paper_weights)
+    return Simulator.of(paper, paper_weights)
 
 
 @pytest.fixture(params=["residual", "paper"])
@@ -319,3 +321,31 @@ def test_a_rollout_can_be_exported_for_any_batch(scene: Scene) -> None:
     )
     exported = export.export(jax.jit(simulator.rollout))(*given)
     assert exported.in_avals[0].shape == (count, links, 13)
+
+
+@pytest.mark.parametrize("detail", ["lean", "full"])
+def test_humans_of_other_sizes_are_simulated_by_the_same_program(detail: Detail) -> None:
+    def program(height: float, mass: float) -> str:
+        scene = human_and_ball(height, mass, detail=detail)
+        state = jnp.zeros((2, len(scene.links), packed.SIZE), jnp.float32)
+        controls = jnp.zeros((2, 3, len(scene.motors), 3), jnp.float32)
+        simulator = Simulator.of_physics(scene)
+        lowered = jax.jit(lambda simulator, *given: simulator.rollout(*given)).lower(simulator, state, controls)
+        return str(lowered.as_text())
+
+    assert program(1.6, 50.0) == program(1.9, 100.0)
+
+
+def test_a_human_of_another_size_moves_as_its_own_model_says() -> None:
+    scene = human_and_ball(1.6, 50.0).only("human")
+    simulator, own = Simulator.of_physics(scene), ResidualModel(scene)
+    assert simulator.model != own
+    random = np.random.default_rng(0)
+    state = np.zeros((1, len(scene.links), packed.SIZE))
+    state[..., packed.POSITION] = random.normal(0.0, 1.0, (1, len(scene.links), 3))
+    state[..., 2] += 5.0
+    state[..., packed.ORIENTATION] = random.normal(size=(1, len(scene.links), 4))
+    state[..., packed.ORIENTATION] /= np.linalg.norm(state[..., packed.ORIENTATION], axis=-1, keepdims=True)
+    controls = random.normal(0.0, 0.3, (1, len(scene.motors), 3))
+    expected = jax.jit(partial(step, own, simulator.weights))(state, controls)
+    np.testing.assert_allclose(simulator.step(state, controls), expected, rtol=1e-5, atol=1e-5)

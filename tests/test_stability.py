@@ -75,7 +75,7 @@ def test_arguments_that_do_not_fit_are_refused_by_name(ball_model: Simulator, na
 def test_the_state_decides_the_precision_also_where_jax_holds_64_bits(
     scene: Scene, residual: Model, residual_weights: Weights, reference: Reference
 ) -> None:
-    model = Simulator(residual, residual_weights)
+    model = Simulator.of(residual, residual_weights)
     with jax.enable_x64(True):
         for kind in (jnp.float32, jnp.float64):
             state = jnp.asarray(reference.states[None, 0], kind)

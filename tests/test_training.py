@@ -112,12 +112,12 @@ def test_a_training_cut_off_goes_on_as_if_it_had_not_been(
     sources = [(swings, 1.0)]
     whole, log = train(MODEL, SHORT, sources, tmp_path / "whole", quiet=True)
     assert [row["update"] for row in log["history"]] == [100, 200]
-    # A clock on which a checkpoint is due at every hundredth update, and a cut in the second hundred.
+    # A clock on which a checkpoint is due at every hundredth update, and a cut while the first is being written.
     monkeypatch.setattr(training, "time", SimpleNamespace(perf_counter=count(0.0, 100.0).__next__))
     draw, drawn = Windows.draw, count()
 
     def cut_off(self: Windows, random: np.random.Generator, steps: int) -> Batch:
-        if next(drawn) == 182:  # after 32 batches for the statistics and 150 updates
+        if next(drawn) == 132:  # after 32 batches for the statistics and 100 updates
             raise KeyboardInterrupt
         return draw(self, random, steps)
 

@@ -14,9 +14,9 @@ from larp_model import rotation
 from larp_model import state as packed
 from larp_model.kinematics import Kinematics, apply, ends_on_ground, kinematics
 from larp_model.learned.model import network_name
-from larp_model.mechanics import BodyMotion, Constants, free_motion
 from larp_model.networks import Measured, Perceptron, Size, Statistics, Weights, bounded, evaluate, side_by_side
 from larp_model.physics.collision import ContactSettings
+from larp_model.physics.motion import BodyMotion, Constants, free_motion
 from larp_model.physics.step import step as physics_step
 from larp_model.scene import Body, Scene
 

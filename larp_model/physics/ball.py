@@ -1,6 +1,6 @@
 """A ball within a step, in the air and on the ground: MuJoCo's law of contact in substeps, each in closed form.
 
-Arrays have the batch last, as in `mechanics`: vectors (1, 3, B).
+Arrays have the batch last, as in `linalg`: vectors (1, 3, B).
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from jax import Array
 
 from larp_model import state as packed
 from larp_model.contact import IMPEDANCE
-from larp_model.mechanics import BodyMotion, moments
 from larp_model.physics.contact import stuck_or_sliding
+from larp_model.physics.motion import BodyMotion, moments
 from larp_model.scene import Body
 
 SUBSTEPS = 20

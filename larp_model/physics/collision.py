@@ -1,6 +1,6 @@
 """Pairs of links that can touch in a step: their smallest gaps, and their closest points.
 
-Arrays have the batch last, as in `mechanics`.
+Arrays have the batch last, as in `linalg`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from larp_model.contact import Axis, nearest
-from larp_model.mechanics import cross
+from larp_model.linalg import cross
 from larp_model.scene import Scene, Surface
 from larp_model.vector import Vector
 
@@ -40,8 +40,9 @@ class ContactSettings:
 class Links(NamedTuple):
     """All links of a scene in a step: position, half axis [m], velocity and spin when it begins, (L, 3, B) each.
 
-    acceleration, turning: mean ones [m/s^2, rad/s^2] if nothing touches. uncounted, uncounted_turning: accelerations
-    that contacts do not count, see `mechanics.velocity_products`. sizes: (L, 3, B).
+    acceleration, turning: mean ones [m/s^2, rad/s^2] if nothing touches, which change by jerk, angular_jerk [m/s^3,
+    rad/s^3]. uncounted, uncounted_turning: accelerations that contacts do not count, see `motion.velocity_products`.
+    sizes: (L, 3, B).
     """
 
     position: Array
@@ -50,6 +51,8 @@ class Links(NamedTuple):
     spin: Array
     acceleration: Array
     turning: Array
+    jerk: Array
+    angular_jerk: Array
     uncounted: Array
     uncounted_turning: Array
     sizes: Array

@@ -15,7 +15,7 @@ analytically invertible dynamics with contacts and constraints", 2014). Over a t
 with the admittance A of all contacts. All J are found by Newton's method with an exact line search, and differentiated
 by this condition, not through the iterations: dJ = P_K' d(m (u_ref - u_free - A J)).
 
-Arrays have the batch last, as in `mechanics`: vectors (n, 3, B), matrices (n, 3, 3, B).
+Arrays have the batch last, as in `linalg`: vectors (n, 3, B), matrices (n, 3, 3, B).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from larp_model.contact import IMPEDANCE
-from larp_model.mechanics import held, invert, mm, mv
+from larp_model.linalg import barrier, dot, inverse, mm, mv
 
 # Where the line search looks, in shares of a Newton step.
 SHARES = (0.015625, 0.0625, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0)
@@ -75,7 +75,7 @@ class ContactProblem(NamedTuple):
     def wanted(self, velocity: Array) -> tuple[Array, Array]:
         """Return the impulses (C, 3, B) that velocities u' call for, and how they fall with u' (C, 3, 3, B) [kg]."""
         point, slope = projection(self.mass * (self.reference - velocity), self.normal, self.friction)
-        return self.active * point, held((self.active * self.mass)[:, None] * slope)
+        return self.active * point, barrier((self.active * self.mass)[:, None] * slope)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(2,))
@@ -132,7 +132,7 @@ def _one_by_one(problem: ContactProblem, guess: Array) -> Array:
     """
     own = jnp.stack([problem.admittance[number, number] for number in range(len(guess))])
     pull = problem.reference - (problem.after(guess) - mv(own, guess))
-    along = _dot(problem.normal, mv(own, problem.normal))
+    along = dot(problem.normal, mv(own, problem.normal))
     across = 0.5 * (own[:, 0, 0] + own[:, 1, 1] + own[:, 2, 2])[:, None] - 0.5 * along
     push, tangent, length = _apart(pull, problem.normal)
     soft = 1.0 / problem.mass
@@ -171,7 +171,7 @@ def projection(wanted: Array, normal: Array, friction: Array | float) -> tuple[A
     bent = jnp.clip(friction * share / length, 0.0, 1.0)
     sliding = edge[:, :, None] * edge[:, None] * steep[:, None] + bent[:, None] * across
     # One decision for all blocks of a matrix: a compiler may work it out anew for each, and round otherwise.
-    inside, pushed = held((length <= friction * along, friction * length > -along))
+    inside, pushed = barrier((length <= friction * along, friction * length > -along))
     point = jnp.where(inside, wanted, share * edge) * pushed
     return point, jnp.where(inside[:, None], unit, sliding) * pushed[:, None]
 
@@ -186,14 +186,9 @@ def projected(wanted: Array, normal: Array, friction: Array | float) -> Array:
 
 def _apart(wanted: Array, normal: Array) -> tuple[Array, Array, Array]:
     """Return vectors along normals (n, 1, B), across them (n, 3, B), and how long those are (n, 1, B)."""
-    along = _dot(wanted, normal)
+    along = dot(wanted, normal)
     tangent = wanted - along * normal
-    return along, tangent, jnp.sqrt(_dot(tangent, tangent) + 1e-12)
-
-
-def _dot(first: Array, second: Array) -> Array:
-    x, y, z = (first[:, axis : axis + 1] * second[:, axis : axis + 1] for axis in range(3))
-    return x + y + z
+    return along, tangent, jnp.sqrt(dot(tangent, tangent) + 1e-12)
 
 
 def solved(matrix: list[list[Array]], right: Array) -> Array:
@@ -202,7 +197,7 @@ def solved(matrix: list[list[Array]], right: Array) -> Array:
     rows, values = [list(row) for row in matrix], [right[i : i + 1] for i in range(count)]
     pivots = []
     for i in range(count):
-        pivots.append(invert(rows[i][i]))
+        pivots.append(inverse(rows[i][i]))
         for j in range(i + 1, count):
             factor = mm(rows[j][i], pivots[i])
             values[j] = values[j] - mv(factor, values[i])

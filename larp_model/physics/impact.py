@@ -2,9 +2,10 @@
 
 Bodies move on as if nothing touched them, but for the ground that carries articulated bodies, and respond to impulses
 linearly (`response`). So a step's contacts are solved for between the few links that touch, in substeps, by the law of
-`contact` and MuJoCo's semi-implicit Euler rule, and all other links are told once what became of it.
+`contact`, and all other links are told once what became of it. Substeps leapfrog: velocities change at once at their
+middle, by the forces of where the sides are then, so that MuJoCo's motion at small steps is met to second order in h.
 
-Arrays have the batch last, as in `mechanics`.
+Arrays have the batch last, as in `linalg`.
 """
 
 from __future__ import annotations
@@ -18,10 +19,12 @@ import numpy as np
 from jax import Array
 
 from larp_model.contact import IMPEDANCE
-from larp_model.mechanics import Articulation, Momenta, cross, moments
+from larp_model.linalg import cross, cross_columns, cross_rows, mv
 from larp_model.physics import contact
+from larp_model.physics.articulated import Momenta
 from larp_model.physics.collision import Candidates, ContactSettings, Links, Sides, closest, picked, sides_of, turned
 from larp_model.physics.contact import ContactProblem
+from larp_model.physics.motion import Articulation, moments
 from larp_model.physics.response import responses
 from larp_model.scene import Scene, Surface
 
@@ -43,7 +46,8 @@ class Gained(NamedTuple):
 class SideStates(NamedTuple):
     """The sides in a substep, (S, 3, B) each, and (C, 3, B) impulses of the one before.
 
-    fading, fading_turning: the part of velocity and spin that servos take back.
+    centre, half: at its middle. velocity, spin: when it begins. fading, fading_turning: the part of them that servos
+    take back.
     """
 
     centre: Array
@@ -182,7 +186,7 @@ class System:
         self.coupled, self.couplings = _couplings(scene, sides, spread)
         self.same, self.together = _same_balls(scene, sides, balls)
         self.position, self.half, self.velocity, self.spin, *rates = (sides.of(each) for each in links[:-1])
-        self.acceleration, self.turning, self.uncounted, self.uncounted_turning = rates
+        self.acceleration, self.turning, self.jerk, self.angular_jerk, self.uncounted, self.uncounted_turning = rates
         self.radius, self.light, self.turns = (
             sides.of(each) for each in (links.sizes[:, 1:2], *_looseness(links.sizes))
         )
@@ -195,9 +199,9 @@ class System:
             self._constants(name, chosen, *surfaces) for name in ("stiffness", "damping", "friction")
         )
         self.mass = self._mass()
-        # Of what fades, so much is left after a substep, and so much there is on average of what it has gained.
+        # Of what fades, so much is left after a substep, and so much of what was gained at its middle.
         self.left = float(np.exp(-self.h / settings.fade))
-        self.mean = settings.fade / self.h * (1.0 - self.left)
+        self.remaining = float(np.exp(-0.5 * self.h / settings.fade))
 
     def _constants(self, name: str, chosen: Array, of_pairs: Sequence[Surface], of_balls: Sequence[Surface]) -> Array:
         """Return a constant of the contacts' surfaces, (C, 1, B)."""
@@ -241,14 +245,14 @@ class System:
     def gains(self, arms: Array) -> tuple[Array, Array]:
         """Return velocities and spins (2, n, 3, 3, B), kept and fading, of coupled sides by impulses at contacts."""
         linear, angular = (
-            each[:, :, :, :3] + _cross_rows(each[:, :, :, 3:], arms[self.coupled[1]]) for each in self.couplings
+            each[:, :, :, :3] + cross_rows(each[:, :, :, 3:], arms[self.coupled[1]]) for each in self.couplings
         )
         return linear, angular
 
     def admittance(self, arms: Array, gains: tuple[Array, Array]) -> Array:
         """Return A (C, C, 3, 3, B) [1/kg] of `contact`."""
         (linear, angular), unit = gains, jnp.eye(3, dtype=self.dtype)[..., None]
-        at_contact = linear - _cross_columns(arms[self.coupled[0]], angular)
+        at_contact = linear - cross_columns(arms[self.coupled[0]], angular)
         one, two = arms[self.same[0]], arms[self.same[1]]
         # -[r] [s] = (r s) 1 - s r'
         inner = one[:, 0] * two[:, 0] + one[:, 1] * two[:, 1] + one[:, 2] * two[:, 2]
@@ -258,7 +262,7 @@ class System:
         every = range(self.pairs + self.balls)
         blocks = [[jnp.zeros((3, 3, arms.shape[-1]), self.dtype) for _ in every] for _ in every]
         for (first, second), matrices in (
-            (self.coupled, at_contact[0] + self.mean * at_contact[1]), (self.same, of_balls),
+            (self.coupled, at_contact[0] + self.remaining * at_contact[1]), (self.same, of_balls),
         ):  # fmt: skip
             signs, rows, columns = self.sign[first] * self.sign[second], self.contact_of[first], self.contact_of[second]
             for row, column, sign, matrix in zip(rows, columns, signs.tolist(), matrices, strict=True):
@@ -271,7 +275,7 @@ class System:
         for gain, loose, each in zip(gains, (self.light, self.turns), (on_sides, torques), strict=True):
             own = (self.together[:, None] * loose[self.same[1]] * each[self.same[1]])[None]
             of_balls = _onto(own, self.same[0], self.sides)
-            of_links = _onto(_mv(gain, on_sides[self.coupled[1]]), self.coupled[0], self.sides)
+            of_links = _onto(mv(gain, on_sides[self.coupled[1]]), self.coupled[0], self.sides)
             found.append(of_links + jnp.concatenate([of_balls, jnp.zeros_like(of_balls)]))
         return found[0], found[1]
 
@@ -280,9 +284,10 @@ class System:
         (moves, totals), h = carry, self.h
         arms, normal, gap = self.contacts(moves)
         gains = self.gains(arms)
-        # What servos take back is no acceleration of the joints.
-        faster = h * self.acceleration + (self.left - 1.0) * moves.fading
-        spinning = h * self.turning + (self.left - 1.0) * moves.fading_turning
+        # Accelerations are mean ones where `late` is zero. What servos take back is no acceleration of the joints.
+        late = (number + 0.5) * h - 0.5 * self.dt
+        faster = h * (self.acceleration + late * self.jerk) + (self.left - 1.0) * moves.fading
+        spinning = h * (self.turning + late * self.angular_jerk) + (self.left - 1.0) * moves.fading_turning
         now = self.relative(moves.velocity + cross(moves.spin, arms))
         uncounted = self.relative(self.uncounted + cross(self.uncounted_turning, arms))
         problem = ContactProblem(
@@ -298,22 +303,22 @@ class System:
         on_sides = jnp.concatenate([-impulses[: self.pairs], impulses])
         torques = cross(arms, on_sides)
         gained, gained_turning = self.gained(gains, on_sides, torques)
-        velocity = moves.velocity + faster + gained[0] + self.mean * gained[1]
-        spin = moves.spin + spinning + gained_turning[0] + self.mean * gained_turning[1]
+        velocity = moves.velocity + faster + gained[0] + self.remaining * gained[1]
+        spin = moves.spin + spinning + gained_turning[0] + self.remaining * gained_turning[1]
         after = SideStates(
             centre=moves.centre + h * velocity,
             half=turned(moves.half, h * spin),
             velocity=velocity,
             spin=spin,
-            fading=self.left * moves.fading + self.mean * gained[1],
-            fading_turning=self.left * moves.fading_turning + self.mean * gained_turning[1],
+            fading=self.left * moves.fading + self.remaining * gained[1],
+            fading_turning=self.left * moves.fading_turning + self.remaining * gained_turning[1],
             impulses=impulses,
         )
         # Of these impulses so much is there at the end of the step, and acts, all in all, for so long.
-        rest, fade = self.dt - (number + 1.0) * h, self.settings.fade
-        fades = self.mean * jnp.exp(-rest / fade)
+        rest, fade = self.dt - (number + 0.5) * h, self.settings.fade
+        fades = jnp.exp(-rest / fade)
         there = jnp.stack([jnp.ones_like(rest), fades])
-        lasts = jnp.stack([rest + h, self.mean * (h + fade) - fade * fades])
+        lasts = jnp.stack([rest, fade * (1.0 - fades)])
         (forces, moments), (travel, swing) = totals
         there, lasts = (each[:, None, None, None] for each in (there, lasts))
         sums = (
@@ -326,7 +331,8 @@ class System:
         """Return the impulses of all substeps."""
         still = jnp.zeros_like(self.position)
         none = jnp.zeros((self.pairs + self.balls, *still.shape[1:]), self.dtype)
-        begun = SideStates(self.position, self.half, self.velocity, self.spin, still, still, none)
+        ahead = self.position + 0.5 * self.h * self.velocity, turned(self.half, 0.5 * self.h * self.spin)
+        begun = SideStates(*ahead, self.velocity, self.spin, still, still, none)
         nothing = jnp.zeros((2, *still.shape), self.dtype)
         numbers = jnp.arange(self.settings.substeps, dtype=self.dtype)
         (_, totals), _ = jax.lax.scan(self.substep, (begun, ((nothing, nothing), (nothing, nothing))), numbers)
@@ -344,23 +350,3 @@ def _summed(gains: Array, wrench: Array) -> Array:
     # A sum of slices: XLA hands a reduction to a library that takes ten times as long to begin.
     each = [gains[part, :, :, k] * wrench[part, k] for part in range(2) for k in range(wrench.shape[1])]
     return sum(each[1:], each[0])
-
-
-def _mv(matrix: Array, vector: Array) -> Array:
-    """Return matrices (2, n, 3, 3, B) times vectors (n, 3, B)."""
-    a, b, c = (matrix[:, :, :, k] * vector[None, :, None, k] for k in range(3))
-    return a + b + c
-
-
-def _cross_rows(matrix: Array, vector: Array) -> Array:
-    """Return M [v] of matrices (2, n, 3, 3, B) and vectors (n, 3, B)."""
-    a, b, c = (matrix[:, :, :, k] for k in range(3))
-    x, y, z = (vector[None, :, None, k] for k in range(3))
-    return jnp.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=3)
-
-
-def _cross_columns(vector: Array, matrix: Array) -> Array:
-    """Return [v] M of matrices (2, n, 3, 3, B) and vectors (n, 3, B)."""
-    a, b, c = (matrix[:, :, k] for k in range(3))
-    x, y, z = (vector[None, :, k, None] for k in range(3))
-    return jnp.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=2)

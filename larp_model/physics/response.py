@@ -7,7 +7,7 @@ by damping and stiffness as well. An implicit step of length T knows
 
 so that w(t) = W_kept + W_fading exp(-t / T) is right at once and on average over T.
 
-Arrays have the batch last, as in `mechanics`; C impulses are worked on side by side, (n, 3, C, B).
+Arrays have the batch last, as in `linalg`; C impulses are worked on side by side, (n, 3, C, B).
 """
 
 from __future__ import annotations
@@ -20,23 +20,21 @@ import numpy as np
 from jax import Array
 
 from larp_model.kinematics import strength
-from larp_model.mechanics import (
+from larp_model.linalg import barrier, cross_columns, mm
+from larp_model.physics.articulated import (
     Anchors,
-    Articulation,
     Inertia,
     Joined,
-    Level,
     Momenta,
     carried_back,
-    cross_columns,
-    held,
-    inverse,
+    inverse_inertia,
     inwards,
-    mm,
+    levels_of,
     packed_inertia,
     tree,
     with_children,
 )
+from larp_model.physics.motion import Articulation
 from larp_model.scene import Body
 
 Arrays = TypeVar("Arrays", Articulation, Momenta)
@@ -57,19 +55,16 @@ def responses(
     sizes (n, 3, B). See the module.
     """
     if not body.joints:
-        kept = _gained(body, articulation.tied, [], inverse(articulation.inertia), pushes)
+        kept = _gained(body, articulation.tied, [], inverse_inertia(articulation.inertia), pushes)
         return kept, Gains(*(jnp.zeros_like(each) for each in kept))
     # W(0) and W(T) side by side.
     doubled = _twice(articulation)
     resisting = jnp.concatenate([_resistance(body, sizes, after) for after in (0.0, fade)], axis=-1)
     unit = jnp.eye(3, dtype=sizes.dtype)[..., None]
     still = jnp.zeros_like(doubled.inertia.moving[:, 0])
-    levels = [
-        Level(rows, above, *(each[rows - 1] for each in (*doubled.tied, still[1:], still[1:], resisting * unit)))
-        for rows, above in tree(body)
-    ]
+    levels = levels_of(body, doubled.tied, still[1:], still[1:], resisting * unit)
     whole, _, joints = inwards(doubled.inertia, Momenta(still, still), levels)
-    gained = _gained(body, doubled.tied, joints, inverse(whole), _twice(pushes))
+    gained = _gained(body, doubled.tied, joints, inverse_inertia(whole), _twice(pushes))
     now, later = (Gains(*each) for each in zip(*(jnp.split(each, 2, axis=-1) for each in gained), strict=True))
     # W(0) = kept + fading, W(T) = kept + fading / 2
     kept = Gains(*(2.0 * b - a for a, b in zip(now, later, strict=True)))
@@ -90,16 +85,16 @@ def _resistance(body: Body, sizes: Array, after: float) -> Array:
 
 
 def _gained(body: Body, tied: Anchors, joints: list[Joined], root: Inertia, pushes: Momenta) -> Gains:
-    """Return what links gain by pushes, the inertias of the tree being known: see `mechanics.inwards`."""
+    """Return what links gain by pushes, the inertias of the tree being known: see `articulated.inwards`."""
     levels, halves = tree(body), []
     every = jnp.concatenate([pushes.turning, pushes.moving], axis=1)
     handed, below = every[:0], np.array([], int)
     for (rows, above), joint in zip(reversed(levels), reversed(joints), strict=True):
-        own = held(with_children(every[rows], rows, handed, below))
+        own = barrier(with_children(every[rows], rows, handed, below))
         child, arm = tied.child[rows - 1], tied.child[rows - 1] - tied.parent[rows - 1]
-        half = held(mm(joint.solved, own[:, :3] - cross_columns(child, own[:, 3:])))
+        half = barrier(mm(joint.solved, own[:, :3] - cross_columns(child, own[:, 3:])))
         halves.append(half)
-        handed, below = held(carried_back(arm, own - mm(jnp.swapaxes(joint.half, 1, 2), half))), above
+        handed, below = barrier(carried_back(arm, own - mm(jnp.swapaxes(joint.half, 1, 2), half))), above
     at_root = with_children(every[:1], np.array([0]), handed, below)
     motions, order = [mm(packed_inertia(root), at_root)], [np.array([0])]
     for (rows, above), joint, half in zip(levels, joints, reversed(halves), strict=True):
@@ -107,9 +102,9 @@ def _gained(body: Body, tied: Anchors, joints: list[Joined], root: Inertia, push
         child, arm = tied.child[rows - 1], tied.child[rows - 1] - tied.parent[rows - 1]
         carried = parent[:, 3:] + cross_columns(arm, parent[:, :3])
         given = jnp.concatenate([parent[:, :3], carried], axis=1)
-        relative = held(mm(jnp.swapaxes(joint.solved, 1, 2), half) - mm(joint.by_parent, given))
+        relative = barrier(mm(jnp.swapaxes(joint.solved, 1, 2), half) - mm(joint.by_parent, given))
         velocity = carried + cross_columns(child, relative)
-        motions.append(held(jnp.concatenate([parent[:, :3] + relative, velocity], axis=1)))
+        motions.append(barrier(jnp.concatenate([parent[:, :3] + relative, velocity], axis=1)))
         order.append(rows)
     motion = jnp.concatenate(motions)[np.argsort(np.concatenate(order))]
     return Gains(motion[:, 3:], motion[:, :3])

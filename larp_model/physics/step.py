@@ -14,19 +14,11 @@ import numpy as np
 from jax import Array
 
 from larp_model import state as packed
-from larp_model.mechanics import (
-    Articulation,
-    BodyMotion,
-    Constants,
-    articulated_motion,
-    mv,
-    turn,
-    turns,
-    velocity_products,
-)
+from larp_model.linalg import mv, rotated, rotation_matrices
 from larp_model.physics.ball import ball_motion, flight
 from larp_model.physics.collision import Candidates, ContactSettings, Links
 from larp_model.physics.impact import integrate
+from larp_model.physics.motion import Articulation, BodyMotion, Constants, articulated_motion, velocity_products
 from larp_model.scene import Body, Scene
 
 # Scenes in which links touch are worked on so many side by side: more do not fit into the caches of a core.
@@ -124,20 +116,21 @@ def _links(scene: Scene, given: Given, motion: BodyMotion, articulations: dict[s
         for columns in (packed.POSITION, packed.ORIENTATION, packed.VELOCITY, packed.ANGULAR_VELOCITY)
     )
     axes = jnp.array([link.axis for link in scene.links], given.state.dtype)[..., None]
-    half = 0.5 * given.sizes[:, :1] * mv(turns(orientation), axes)
+    half = 0.5 * given.sizes[:, :1] * mv(rotation_matrices(orientation), axes)
     acceleration, turning = (motion.velocity - velocity) / dt, (motion.spin - spin) / dt
-    uncounted, uncounted_turning = [], []
+    rates = []
     for body in scene.bodies:
-        rows = scene.rows(body.name)
-        if body.joints:
-            linear, angular = velocity_products(body, articulations[body.name].tied, spin[rows])
-        else:
-            linear = angular = jnp.zeros_like(spin[rows])
-        uncounted.append(linear)
-        uncounted_turning.append(angular)
-    uncounted_all, uncounted_turning_all = jnp.concatenate(uncounted), jnp.concatenate(uncounted_turning)
+        still = jnp.zeros_like(spin[scene.rows(body.name)])
+        jerks = products = still, still
+        if articulation := articulations.get(body.name):
+            jerks = articulation.jerk, articulation.angular_jerk
+            if body.joints:
+                products = velocity_products(body, articulation.tied, spin[scene.rows(body.name)])
+        rates.append((*jerks, *products))
+    jerk, angular_jerk, uncounted, uncounted_turning = (jnp.concatenate(each) for each in zip(*rates, strict=True))
     return Links(
-        position, half, velocity, spin, acceleration, turning, uncounted_all, uncounted_turning_all, given.sizes
+        position, half, velocity, spin, acceleration, turning, jerk, angular_jerk, uncounted, uncounted_turning,
+        given.sizes,
     )  # fmt: skip
 
 
@@ -145,5 +138,5 @@ def _after(before: Array, motion: BodyMotion) -> Array:
     """Return states (L, 13, B) after a motion."""
     position, orientation = before[:, packed.POSITION], before[:, packed.ORIENTATION]
     return jnp.concatenate(
-        [position + motion.moved, turn(orientation, motion.turned), motion.velocity, motion.spin], axis=1
+        [position + motion.moved, rotated(orientation, motion.turned), motion.velocity, motion.spin], axis=1
     )

@@ -21,6 +21,7 @@ from larp_model.simulator import Simulator
 from larp_model.truth import episodes as truth_episodes
 from larp_model.truth.bullet import BulletTruth
 from larp_model.truth.episodes import Episodes
+from larp_model.truth.mujoco import FINE_SUBSTEPS, Truth
 from tasks.benchmarks import report
 from tasks.command import prepare_jax, run
 from tasks.scenarios import Scenario, around, scenario, trained_at
@@ -59,9 +60,13 @@ def main(
     bodies: Literal["usual", "varied"] = "usual",
     beside: DesignName | None = None,
     bullet: bool = False,
+    substeps: int = FINE_SUBSTEPS,
     publish: bool = False,
 ) -> None:
-    """Compare rollouts of the learned simulator with truth episodes from unseen initial states.
+    """Compare rollouts of the simulator with truth episodes from unseen initial states.
+
+    The truth is MuJoCo at the engine steps at which plans are executed: at those that networks are trained on, its own
+    launches are off by as much as the simulator's.
 
     Args:
         scene: what is simulated.
@@ -74,11 +79,13 @@ def main(
         bodies: varied draws another human for every episode.
         beside: weights of this design, from where `tasks.train --design` leaves them, on the same episodes.
         bullet: also how far Bullet, the second truth, strays from the first.
+        substeps: of the truth, engine steps in a step of the scene.
         publish: put the table into RESULTS.md.
     """
     chosen = around(scenario(scene), reference, bodies == "varied")
-    if sequences < 1:
-        raise InputError(f"sequences is {sequences}, but must be at least 1")
+    for argument, value in (("sequences", sequences), ("substeps", substeps)):
+        if value < 1:
+            raise InputError(f"{argument} is {value}, but must be at least 1")
     what = [
         scene,
         *(path.stem for path in (weights, reference) if path),
@@ -93,11 +100,19 @@ def main(
         raise InputError(
             f"beside is {beside}, but {other} is not there: `python -m tasks.train --scene {scene} --design {beside}`"
         )
-    episodes = chosen.draw(sequences, seed)[0] if states is None else truth_episodes.load(states, chosen.scene)
+    if states is None:
+        drawn, _ = chosen.draw(sequences, seed)
+        truth = Truth(chosen.scene, min(len(drawn.states), 64), substeps)
+        starts, *given = drawn
+        episodes, _ = truth_episodes.record(truth, starts[:, 0], *given)
+    else:
+        episodes = truth_episodes.load(states, chosen.scene)
     found = judged(weights, chosen, episodes)
     source = f"--states {states.name}" if states else f"--sequences {sequences} --seed {seed}"
     if weights:
         source = f"--weights {weights} {source}"
+    if substeps != FINE_SUBSTEPS and states is None:
+        source += f" --substeps {substeps}"
     if reference:
         source += f" --reference {reference.name}"
     if bodies == "varied":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import jax
@@ -11,6 +10,7 @@ import numpy as np
 
 from larp_model import state as packed
 from larp_model.meeting import first_contacts
+from larp_model.simulator import Simulator
 from mpc import CEM, Dynamics, Gradient, evaluate
 from mpc.search import coloured_noise
 from tasks.benchmarks.pushes import Bench, in_double, row
@@ -103,7 +103,7 @@ def of_steps(bench: Bench, count: int, seed: int) -> list[Row]:
 def ball_slopes(bench: Bench) -> list[Row]:
     """What a small change of the ball's height does within a step: where the growth comes from."""
     ball, radius = bench.kick.scene.bodies[-1].name, bench.kick.scene.links[-1].radius
-    model = replace(bench.model, model=bench.model.model.on(bench.kick.scene.only(ball)))
+    model = Simulator.of(bench.model.model.on(bench.kick.scene.only(ball)), bench.model.weights)
     slope = jax.jit(jax.vmap(jax.jacfwd(lambda s: model.step(s[None], jnp.zeros((1, 0, 3)))[0, 0])))
     rows = []
     for name, height, speed in (

@@ -1,4 +1,4 @@
-"""Mechanics of a body alone: conservation, order, agreement with the engine, the ground, symmetry, gradients."""
+"""Motion of a body alone: conservation, order, agreement with the engine, the ground, symmetry, gradients."""
 
 from __future__ import annotations
 
@@ -10,16 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 from jax import Array
 from scipy.spatial.transform import Rotation
 
 from larp_model import kinematics, rotation
 from larp_model import state as packed
 from larp_model.bodies import capsule, chain, human, human_and_ball
-from larp_model.mechanics import GAMMA, BodyMotion, Constants, free_motion, moments, reaction
+from larp_model.physics.motion import GAMMA, BodyMotion, Constants, free_motion, moments
 from larp_model.scene import Body, Scene
 from larp_model.truth.mujoco import Truth, closed, compile_model
 from tasks.motions.references import standing_on_ground
@@ -288,29 +285,6 @@ def test_motors_of_other_sizes_pull_as_those_of_a_body_of_that_size() -> None:
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
 
 
-@settings(max_examples=200, deadline=None)
-@given(asked=arrays(np.float64, 3, elements=st.floats(-10.0, 10.0)), friction=st.floats(0.0, 2.0))
-def test_the_ground_gives_of_what_is_asked_the_nearest_that_friction_allows(asked: np.ndarray, friction: float) -> None:
-    found, slope = (np.asarray(each)[0, ..., 0] for each in reaction(jnp.asarray(asked)[None, :, None], friction))
-    assert np.hypot(*found[:2]) <= friction * found[2] + 1e-5
-    others = np.random.default_rng(0).uniform(-20.0, 20.0, (500, 3))
-    others = others[np.hypot(*others[:, :2].T) <= friction * others[:, 2]]
-    assert np.linalg.norm(asked - found) <= np.linalg.norm(asked - others, axis=1).min(initial=np.inf) + 1e-5
-    np.testing.assert_allclose(slope, slope.T, atol=1e-12)
-    least, _, largest = np.linalg.eigvalsh(slope)
-    assert least > -1e-9 and largest < 1.0 + 1e-9
-
-
-def test_the_slope_of_what_the_ground_gives_is_its_derivative() -> None:
-    asked = jnp.asarray(np.random.default_rng(0).standard_normal((200, 3)))
-
-    def found(one: Array) -> Array:
-        return reaction(one[None, :, None], 0.7)[0][0, :, 0]
-
-    expected = jax.vmap(jax.jacfwd(found))(asked)
-    np.testing.assert_allclose(reaction(asked[..., None], 0.7)[1][..., 0], expected, atol=1e-5)
-
-
 @pytest.mark.parametrize("speed", [1.0, 3.0])
 def test_a_capsule_that_slides_sideways_is_braked_until_it_rolls_as_in_the_truth(speed: float) -> None:
     body = capsule()
@@ -323,6 +297,18 @@ def test_a_capsule_that_slides_sideways_is_braked_until_it_rolls_as_in_the_truth
         states = moved(states, compiled(body)(states, *none))
     np.testing.assert_allclose(states[..., 1], true[:, -1, :, 1], rtol=0.01)
     np.testing.assert_allclose(states[..., [8, 10]], true[:, -1, :, [8, 10]].T, rtol=0.005)
+
+
+def test_a_body_moves_on_the_ground_the_same_whatever_others_need_beside_it() -> None:
+    body = capsule()
+    states = np.zeros((2, 1, packed.SIZE))
+    states[..., packed.ORIENTATION] = Rotation.from_euler("y", 90.0, degrees=True).as_quat(scalar_first=True)
+    states[..., 2] = body.links[0].radius - 1e-4
+    states[1, 0, 8] = 3.0  # slides, and takes more of Newton's steps than one that lies
+    none = np.zeros((2, 0, 3)), np.zeros((2, 1, 3))
+    together = moved(states, compiled(body)(states, *none))
+    alone = moved(states[:1], compiled(body)(states[:1], *(each[:1] for each in none)))
+    np.testing.assert_allclose(together[:1], alone, rtol=0.0, atol=1e-12)
 
 
 def test_who_moves_on_the_ground_stays_within_five_millimetres_of_the_truth_for_a_fifth_of_a_second() -> None:

@@ -1,0 +1,190 @@
+"""The ground under an articulated body: contacts of both ends of all its links, solved together with its motion.
+
+MuJoCo's soft contact: the impulse J on an end whose velocity is v' is the projection of m (v - v') onto the friction
+cone, with the mass m that holds the end and the velocity v that the ground allows (see `physics.contact`). Where J is
+taken as linear around a guess, it adds to the inertia and to the momentum of the link, and one pass of
+`articulated.solve` yields all velocities: a step of Newton's method.
+
+Arrays have the batch last, as in `linalg`: n links, 2 n ends.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from larp_model.linalg import barrier, cross, cross_columns, cross_rows, mv
+from larp_model.physics.articulated import Anchors, Inertia, Momenta, levels_of, solve
+from larp_model.physics.contact import projection
+from larp_model.scene import Body
+
+# Newton's method ends where no impulse is further off, as a share of the body's largest and in units of the precision:
+# 1e-3 in 32 bits.
+TOLERANCE = 1e4
+
+
+class Ends(NamedTuple):
+    """Both ends of all links, (2 n, ..., B), one end of each after the other, and the velocity that the ground allows.
+
+    arm: their lowest points [m] from the links' centres. clearance: their height [m]. allowed: the velocity [m/s] at
+    which neither the spring of the body's surface nor friction pushes them.
+    """
+
+    arm: Array
+    clearance: Array
+    allowed: Array
+
+    @staticmethod
+    def of(
+        body: Body, matrices: Array, height: Array, velocity: Array, spin: Array, sizes: Array, h: float,
+        gains: tuple[Array, Array],
+    ) -> Ends:  # fmt: skip
+        """Return the ends of links by rotations (n, 3, 3, B), heights (n, 1, B) [m] and first velocities (n, 3, B).
+
+        gains: accelerations of the links, (n, 3, B) [m/s^2] and [rad/s^2], that contacts do not count.
+        """
+        surface, upright = body.surface, _upright(matrices)
+        axes = jnp.array([link.axis for link in body.links], matrices.dtype)[..., None]
+        half, down = 0.5 * sizes[:, :1] * mv(matrices, axes), sizes[:, 1:2] * upright
+        arm = jnp.concatenate([half - down, -half - down])
+        speed, clearance = twice(velocity) + cross(twice(spin), arm), twice(height) + arm[:, 2:]
+        speed += h * (twice(gains[0]) + cross(twice(gains[1]), arm))
+        damped = 1.0 + h * surface.damping
+        rising = (speed[:, 2:] - h * surface.stiffness * clearance) / (damped + h**2 * surface.stiffness)
+        return Ends(arm, clearance, speed * (1.0 - upright) / damped + rising * upright)
+
+    def velocity(self, velocity: Array, spin: Array) -> Array:
+        """Return the ends' velocities (2 n, 3, B), from those of the links."""
+        return twice(velocity) + cross(twice(spin), self.arm)
+
+    def at_links(self, masses: Array, momenta: Array) -> tuple[Inertia, Momenta]:
+        """Return what masses (2 n, 3, 3, B) [kg] and momenta (2 n, 3, B) at the ends are to their links."""
+        mixed, links = cross_columns(self.arm, masses), len(self.arm) // 2
+        added = Inertia(-cross_rows(mixed, self.arm), mixed, masses), Momenta(cross(self.arm, momenta), momenta)
+        both: tuple[Inertia, Momenta] = jax.tree.map(lambda ends: ends[:links] + ends[links:], added)
+        return both
+
+
+class GroundMotion(NamedTuple):
+    """Velocities [m/s] and angular velocities [rad/s] of links (n, 3, B) under the ground's impulses.
+
+    active (2 n, 1, B): 1 where an end is in the ground, else 0. impulses (2 n, 3, B) [N s] that these velocities call
+    for. slopes (2 n, 3, 3, B) [kg]: how impulses fall with the ends' velocities.
+    """
+
+    velocity: Array
+    spin: Array
+    active: Array
+    impulses: Array
+    slopes: Array
+
+
+class GroundProblem(NamedTuple):
+    """Links of a body within `h` [s]: what they have without the ground, their joints, and their ends.
+
+    anchors, closing, pull, hold: of the joints, see `Level`. mass (1, 1, B) [kg]: that holds an end, the module's m.
+    """
+
+    inertia: Inertia
+    push: Momenta
+    anchors: Anchors
+    closing: Array
+    pull: Array
+    hold: Array
+    ends: Ends
+    mass: Array
+    h: Array | float
+
+    def at(self, body: Body, velocity: Array, spin: Array, active: Array) -> GroundMotion:
+        """Return what velocities (n, 3, B) call for; ends that were `active` before stay so."""
+        of_ends = self.ends.velocity(velocity, spin)
+        active = jnp.maximum(active, ramp(-self.ends.clearance - self.h * of_ends[:, 2:], 1e-5))
+        up = jnp.broadcast_to(_upright(of_ends), of_ends.shape)
+        impulses, slopes = projection(self.mass * (self.ends.allowed - of_ends), up, body.surface.friction)
+        return GroundMotion(
+            velocity, spin, active, active * impulses, barrier(active[:, None] * self.mass[:, None] * slopes)
+        )
+
+    def linear(self, guess: GroundMotion) -> tuple[Inertia, Momenta]:
+        """Return what impulses that are linear around a guess add to the links' inertia and momentum."""
+        of_ends = self.ends.velocity(guess.velocity, guess.spin)
+        return self.ends.at_links(guess.slopes, guess.impulses + mv(guess.slopes, of_ends))
+
+    def newton(self, body: Body, guess: GroundMotion) -> GroundMotion:
+        """Return the motion under impulses that are linear around a guess."""
+        levels = levels_of(body, self.anchors, self.closing, self.pull, self.hold)
+        inertia, push = barrier(jax.tree.map(jnp.add, (self.inertia, self.push), self.linear(guess)))
+        return self.at(body, *solve(inertia, push, levels), guess.active)
+
+    def converged(self, before: GroundMotion, after: GroundMotion) -> Array:
+        """Return (B,) where the impulses are those that were linear around the motion before, or are not finite."""
+        change = self.ends.velocity(after.velocity - before.velocity, after.spin - before.spin)
+        error = after.impulses - before.impulses + mv(before.slopes, change)
+        size, largest = (jnp.max(jnp.abs(each), axis=(0, 1)) for each in (error, after.impulses))
+        return ~(size > TOLERANCE * jnp.finfo(largest.dtype).eps * largest)
+
+
+def motion_on_ground(body: Body, iterations: int, problem: GroundProblem, velocity: Array, spin: Array) -> GroundMotion:
+    """Return how a body moves on the ground, from a guess of its velocities (n, 3, B).
+
+    iterations: of Newton's method, at most; a body's motion is final once it has converged, whatever others need.
+    """
+    guess = problem.at(body, velocity, spin, jnp.zeros_like(problem.ends.clearance))
+    return _solution(body, iterations, problem, jax.lax.stop_gradient(guess))
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _solution(body: Body, iterations: int, problem: GroundProblem, guess: GroundMotion) -> GroundMotion:
+    Carry = tuple[Array, Array, GroundMotion]
+
+    def goes_on(carry: Carry) -> Array:
+        number, unfinished, _ = carry
+        return (number < iterations) & jnp.any(unfinished)
+
+    def newton(carry: Carry) -> Carry:
+        number, unfinished, before = carry
+        after = problem.newton(body, before)
+        chosen = jax.tree.map(partial(jnp.where, unfinished), after, before)
+        return number + 1, unfinished & ~problem.converged(before, after), chosen
+
+    every = jnp.ones(guess.velocity.shape[-1], bool)
+    return jax.lax.while_loop(goes_on, newton, (jnp.array(0), every, guess))[2]
+
+
+@_solution.defjvp
+def _solution_jvp(
+    body: Body, iterations: int, primals: tuple[GroundProblem, GroundMotion],
+    tangents: tuple[GroundProblem, GroundMotion],
+) -> tuple[GroundMotion, GroundMotion]:  # fmt: skip
+    """Differentiate one more step from the solution, where it does not depend on what it started from."""
+    problem, guess = primals
+    solution = jax.lax.stop_gradient(_solution(body, iterations, problem, guess))
+
+    def step(problem: GroundProblem) -> GroundMotion:
+        same = problem.at(body, solution.velocity, solution.spin, solution.active)
+        return problem.newton(body, same)
+
+    return solution, jax.jvp(step, (problem,), tangents[:1])[1]
+
+
+def ramp(value: Array, width: float) -> Array:
+    """Return 0 where a value is negative, 1 from `width` on, and no slope between.
+
+    A compiler works a comparison out anew beside every block of a matrix, and may round otherwise: blocks that are not
+    of one mind make no matrix that is positive. A ramp differs as little as its argument.
+    """
+    return jax.lax.stop_gradient(jnp.clip(value / width, 0.0, 1.0))
+
+
+def twice(links: Array) -> Array:
+    """Return links (n, ...) for both of their ends (2 n, ...)."""
+    return jnp.concatenate([links, links])
+
+
+def _upright(like: Array) -> Array:
+    """Return the vertical (3, 1), in the precision of another array."""
+    return jnp.array([0.0, 0.0, 1.0], like.dtype)[:, None]
