@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model import kinematics, launches, rotation
+from larp_model import launches, rotation
 from larp_model import state as packed
 from larp_model.errors import InputError
 from larp_model.learned.model import Model
 from larp_model.networks import Weights
+from larp_model.physics import kinematics
 from larp_model.prediction import predict
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator

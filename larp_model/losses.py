@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from larp_model import kinematics
 from larp_model import state as packed
+from larp_model.physics import kinematics
 from larp_model.scene import Scene
 
 # Where a predicted link is further than this from the truth, the sequence has gone another way [m].

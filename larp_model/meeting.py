@@ -14,8 +14,8 @@ from jax import Array
 
 from larp_model import contact
 from larp_model import state as packed
-from larp_model.contact import Closest
-from larp_model.kinematics import Kinematics, kinematics
+from larp_model.contact import Closest, Segment
+from larp_model.physics.kinematics import Kinematics, kinematics
 from larp_model.scene import Body, Pair, Scene
 from larp_model.state import Trajectories
 
@@ -45,6 +45,11 @@ def rows_of(pair: Pair, first: Body, second: Body) -> tuple[np.ndarray, np.ndarr
     return np.array(rows)[:, 0], np.array(rows)[:, 1]
 
 
+def segments(seen: Kinematics, rows: np.ndarray) -> Segment:
+    """Return the axes (B, P, ...) of links by their rows (P,)."""
+    return Segment(*(jnp.moveaxis(each[rows], -1, 0) for each in (seen.position, seen.half, seen.sizes[:, 1])))
+
+
 def meet(
     pair: Pair, bodies: tuple[Body, Body], seen: tuple[Kinematics, Kinematics], after: tuple[Array, Array], dt: float
 ) -> Meeting:
@@ -55,11 +60,11 @@ def meet(
     is seen.
     """
     rows = rows_of(pair, *bodies)
-    segments = [own.segments(links) for own, links in zip(seen, rows, strict=True)]
+    axes = [segments(own, links) for own, links in zip(seen, rows, strict=True)]
     velocities = [
         (packed.velocity(each)[:, links], packed.angular_velocity(each)[:, links])
         for own, end, links in zip(seen, after, rows, strict=True)
-        for each in (own.state, end)
+        for each in (jnp.moveaxis(own.state, -1, 0), end)
     ]
     (v1, w1), (v1_end, w1_end), (v2, w2), (v2_end, w2_end) = velocities
     dv1, dw1, dv2, dw2 = v1_end - v1, w1_end - w1, v2_end - v2, w2_end - w2
@@ -67,8 +72,8 @@ def meet(
     def closest_at(time: Array) -> tuple[Closest, Array]:
         share = (time / dt)[..., None]
         half = 0.5 * share
-        one = contact.moved(segments[0], v1 + half * dv1, w1 + half * dw1, time)
-        two = contact.moved(segments[1], v2 + half * dv2, w2 + half * dw2, time)
+        one = contact.moved(axes[0], v1 + half * dv1, w1 + half * dw1, time)
+        two = contact.moved(axes[1], v2 + half * dv2, w2 + half * dw2, time)
         found = contact.closest(one, two)
         relative = v1 + share * dv1 + jnp.cross(w1 + share * dw1, found.point - one.centre)
         relative -= v2 + share * dv2 + jnp.cross(w2 + share * dw2, found.point - two.centre)
@@ -82,7 +87,7 @@ def meet(
         return time + jnp.where(found.distance > 0.0, ahead, jnp.maximum(back, -time)), found.distance
 
     # A scan, because an unrolled loop would be compiled as many times over.
-    time, gaps = jax.lax.scan(advance, jnp.zeros(segments[0].radius.shape, v1.dtype), length=ADVANCES)
+    time, gaps = jax.lax.scan(advance, jnp.zeros(axes[0].radius.shape, v1.dtype), length=ADVANCES)
     found, _ = closest_at(time)
     lowest = jnp.minimum(gaps[0], found.distance)
     return Meeting(gaps[0], lowest, contact.smooth_gate(lowest, MARGIN), dt - time, found.normal)
@@ -93,7 +98,8 @@ def meetings(scene: Scene, state: Array, morphology: Array, after: Array | None 
 
     after: states (B, L, 13) whose velocities are those at the end of the step; as they are by default.
     """
-    seen, end = kinematics(scene, state, morphology), state if after is None else after
+    seen = kinematics(scene, jnp.moveaxis(state, 0, -1), jnp.moveaxis(morphology, 0, -1))
+    end = state if after is None else after
     found = []
     for pair in scene.pairs:
         names = pair.first, pair.second

@@ -19,10 +19,10 @@ from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.bodies import usual
 from larp_model.errors import InputError
-from larp_model.kinematics import morphology_of
 from larp_model.learned.model import Model
 from larp_model.learned.residual import ResidualModel
 from larp_model.networks import Weights
+from larp_model.physics.kinematics import morphology_of
 from larp_model.runtime import remember_compilations
 from larp_model.scene import Scene
 

@@ -39,7 +39,7 @@ def side_by_side(dynamics: Dynamics) -> int:
 
 
 class BatchedTruth(Protocol):
-    """An engine outside JAX; `larp_model.truth.mujoco.Truth` is one."""
+    """An engine outside JAX; `larp_model.engines.mujoco.Truth` is one."""
 
     @property
     def batch(self) -> int:

@@ -13,7 +13,7 @@ from mpc.planner import Plan, PlanInfo, Planner
 
 
 class World(Protocol):
-    """What the plan is executed in, one step at a time; `larp_model.truth.mujoco.Truth` of batch 1 is one."""
+    """What the plan is executed in, one step at a time; `larp_model.engines.mujoco.Truth` of batch 1 is one."""
 
     def reset(self, states: np.ndarray) -> None:
         """Put the world into states (1, L, 13)."""

@@ -19,6 +19,8 @@ from larp_model import designs, evaluation, training
 from larp_model import weights as stored
 from larp_model.anatomy import Detail
 from larp_model.designs import SizeName
+from larp_model.engines import episodes as truth_episodes
+from larp_model.engines.episodes import Episodes
 from larp_model.errors import InputError
 from larp_model.files import require_writable
 from larp_model.learned.model import Model
@@ -26,8 +28,6 @@ from larp_model.learned.residual import ResidualModel
 from larp_model.names import require_file
 from larp_model.networks import Weights
 from larp_model.simulator import Simulator
-from larp_model.truth import episodes as truth_episodes
-from larp_model.truth.episodes import Episodes
 from tasks.command import prepare_jax, run
 from tasks.data import WINDOWS, random_episodes
 from tasks.kick import Kick

@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
 from larp_model.bodies import segment_of
-from larp_model.kinematics import morphology_of
+from larp_model.engines.episodes import Episodes, record
+from larp_model.engines.mujoco import Truth, closed
 from larp_model.meeting import meetings
+from larp_model.physics.kinematics import morphology_of
 from larp_model.rotation import turned_about_z
 from larp_model.scene import Link, Scene
-from larp_model.truth.episodes import Episodes, record
-from larp_model.truth.mujoco import Truth, closed
 from tasks.motions.people import random_people
 from tasks.motions.references import Reference, clearance, resting
 

@@ -12,8 +12,8 @@ from jax import Array
 from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
-from larp_model.kinematics import morphology_of
 from larp_model.meeting import meetings
+from larp_model.physics.kinematics import morphology_of
 from larp_model.scene import Scene
 
 # The ball has been struck when it is faster than this [m/s]; its launch is read so many steps later.

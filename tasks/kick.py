@@ -19,10 +19,10 @@ import numpy as np
 
 from larp_model import state as packed
 from larp_model.anatomy import Detail
+from larp_model.engines.mujoco import FINE_SUBSTEPS, Truth
 from larp_model.errors import InputError
 from larp_model.files import require_writable
 from larp_model.names import require_file
-from larp_model.truth.mujoco import FINE_SUBSTEPS, Truth
 from mpc import CostTerm, l2, quadratic
 from mpc.loop import Execution
 from tasks import residuals

@@ -17,9 +17,9 @@ import jax
 import numpy as np
 
 from larp_model import state as packed
+from larp_model.engines.mujoco import Truth
 from larp_model.errors import InputError
 from larp_model.scene import Scene
-from larp_model.truth.mujoco import Truth
 from mpc.loop import Diverged, Execution, Replan, Window
 from tasks.models import NO_WEIGHTS, DynamicsName, Models
 from tasks.presets import Preset

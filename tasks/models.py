@@ -10,10 +10,10 @@ import numpy as np
 
 from larp_model import evaluation
 from larp_model import weights as stored
+from larp_model.engines.mujoco import SUBSTEPS, Truth
 from larp_model.names import require_known
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
-from larp_model.truth.mujoco import SUBSTEPS, Truth
 from mpc import Continued, Dynamics, MujocoDynamics
 
 # Steps that a plan looks beyond the reference's strike with the ball alone.

@@ -21,11 +21,11 @@ from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
 from larp_model.bodies import human, standing_height
+from larp_model.engines.mujoco import SUBSTEPS, Truth
 from larp_model.errors import InputError
 from larp_model.files import require_writable, write_whole
 from larp_model.scene import Body, Scene
 from larp_model.simulator import Simulator
-from larp_model.truth.mujoco import SUBSTEPS, Truth
 from mpc import Dynamics, MujocoDynamics
 from mpc.loop import Begun, Execution
 from tasks.command import Teller, prepare_jax, run

@@ -20,10 +20,10 @@ from rich.console import Console
 
 from larp_model import state as packed
 from larp_model.bodies import human_and_ball, standing_height
+from larp_model.engines.mujoco import Truth
 from larp_model.errors import InputError
 from larp_model.files import write_whole
 from larp_model.scene import Scene
-from larp_model.truth.mujoco import Truth
 from tasks.command import run
 from tasks.data import SHIFT, smooth_noise, stray
 from tasks.motions import key_poses

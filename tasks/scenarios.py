@@ -11,10 +11,10 @@ from pathlib import Path
 from larp_model.anatomy import KINDS
 from larp_model.bodies import chain, detail_of, human_and_ball, human_and_capsule, two_balls, two_chains
 from larp_model.designs import DesignName, SizeName
+from larp_model.engines.episodes import Episodes
 from larp_model.errors import InputError
 from larp_model.names import require_file, require_known
 from larp_model.scene import Scene
-from larp_model.truth.episodes import Episodes
 from tasks.data import WINDOWS, random_episodes
 from tasks.motions import references
 from tasks.motions.generator import any_episodes

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
+from larp_model.engines.mujoco import Truth
 from larp_model.scene import Scene
-from larp_model.truth.mujoco import Truth
 
 # Standard deviations: the ball's place [m], joint angles about each axis [degrees], velocities as shares of themselves.
 BALL, JOINTS, VELOCITIES = 0.005, 0.5, 0.02

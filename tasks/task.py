@@ -29,10 +29,10 @@ from rich.table import Table
 from larp_model import state as packed
 from larp_model.anatomy import Detail
 from larp_model.bodies import human_and_ball, standing_height
+from larp_model.engines.mujoco import FINE_SUBSTEPS, Truth
 from larp_model.errors import InputError
 from larp_model.files import require_writable, write_whole
 from larp_model.scene import Scene
-from larp_model.truth.mujoco import FINE_SUBSTEPS, Truth
 from mpc import CostTerm, Dynamics, Optimizer, Planner, Verified, quadratic
 from mpc.loop import Execution, Phase, Replan, Window, World, execute
 from tasks import residuals

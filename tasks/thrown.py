@@ -6,9 +6,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
+from larp_model.engines.episodes import Episodes, record
+from larp_model.engines.mujoco import Truth, closed
 from larp_model.scene import Scene
-from larp_model.truth.episodes import Episodes, record
-from larp_model.truth.mujoco import Truth, closed
 from tasks.data import overlaps
 from tasks.motions.references import clearance
 

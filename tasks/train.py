@@ -24,15 +24,15 @@ from rich.console import Console
 from larp_model import designs, evaluation, training
 from larp_model import weights as stored
 from larp_model.designs import DesignName, SizeName
+from larp_model.engines import episodes as truth_episodes
+from larp_model.engines.episodes import Episodes
+from larp_model.engines.mujoco import SUBSTEPS
 from larp_model.errors import InputError
 from larp_model.files import require_writable, write_whole
 from larp_model.names import require_file
 from larp_model.networks import Weights
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
-from larp_model.truth import episodes as truth_episodes
-from larp_model.truth.episodes import Episodes
-from larp_model.truth.mujoco import SUBSTEPS
 from tasks.command import prepare_jax, run
 from tasks.curve import curve_picture
 from tasks.scenarios import scenario, trained_at

@@ -9,8 +9,8 @@ from dataclasses import replace
 import jax
 import numpy as np
 
-from larp_model.truth.episodes import Episodes
-from larp_model.truth.mujoco import SUBSTEPS
+from larp_model.engines.episodes import Episodes
+from larp_model.engines.mujoco import SUBSTEPS
 from mpc import Continued, GaussNewton, MujocoDynamics
 from mpc.dynamics import BatchedTruth
 from tasks.data import random_task

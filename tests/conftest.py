@@ -11,6 +11,7 @@ import pytest
 from hypothesis import settings
 
 from larp_model.bodies import human_and_ball
+from larp_model.engines.episodes import Episodes
 from larp_model.learned.model import Model
 from larp_model.learned.paper import PaperModel, Sizes
 from larp_model.learned.residual import ResidualModel
@@ -19,7 +20,6 @@ from larp_model.runtime import remember_compilations
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from larp_model.training import Recipe, Windows, statistics_of
-from larp_model.truth.episodes import Episodes
 from tasks.data import random_episodes
 from tasks.motions.references import Reference, embedded
 

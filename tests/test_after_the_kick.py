@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from larp_model import kinematics
 from larp_model import state as packed
+from larp_model.physics import kinematics
 from mpc import evaluate
 from tasks import kick, sensing
 from tasks.data import random_roll

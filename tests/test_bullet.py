@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
 from larp_model.bodies import ball, capsule, chain, human
+from larp_model.engines.bullet import BulletTruth, give, inertia
+from larp_model.engines.mujoco import Truth, compile_model
 from larp_model.errors import InputError
 from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface
-from larp_model.truth.bullet import BulletTruth, give, inertia
-from larp_model.truth.mujoco import Truth, compile_model
 from tasks.benchmarks.model import second_opinion
 from tasks.data import smooth_noise, stray
 from tasks.motions.references import Reference, standing_on_ground

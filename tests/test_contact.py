@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from larp_model import contact
 from larp_model import state as packed
 from larp_model.contact import Closest, Segment
-from larp_model.kinematics import morphology_of
 from larp_model.meeting import Meeting, meetings
+from larp_model.physics.kinematics import morphology_of
 from larp_model.scene import Scene, Vector
 
 closest = jax.jit(contact.closest)

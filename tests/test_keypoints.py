@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from larp_model.bodies import human_and_ball
+from larp_model.engines.mujoco import closed
 from larp_model.errors import InputError
 from larp_model.scene import Scene
-from larp_model.truth.mujoco import closed
 from tasks.keypoints import camera as cameras
 from tasks.keypoints import figure as figures
 from tasks.keypoints import filmed, lift, metrics, physical

@@ -13,11 +13,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from larp_model.bodies import ball, human, kicking, standing_height
+from larp_model.engines.mujoco import Truth
 from larp_model.errors import InputError
-from larp_model.kinematics import displacement
 from larp_model.mjcf import humanoid, usual_name
+from larp_model.physics.kinematics import displacement
 from larp_model.scene import Body, Link, anchor
-from larp_model.truth.mujoco import Truth
 from tasks.motions.references import standing_on_ground
 
 MUJOCOS = Path(mujoco.__file__).parent / "mjx/test_data/humanoid/humanoid.xml"

@@ -14,17 +14,17 @@ from jax import Array
 
 from larp_model import rotation
 from larp_model import state as packed
-from larp_model.kinematics import morphology_of
+from larp_model.engines.episodes import Episodes
 from larp_model.learned.model import Model, initial_weights
 from larp_model.learned.paper import PaperModel, Sizes
 from larp_model.learned.residual import ResidualModel, changes, true_motion
 from larp_model.meeting import first_contacts
 from larp_model.networks import Size, Weights
 from larp_model.physics.collision import ContactSettings
+from larp_model.physics.kinematics import kinematics, morphology_of
 from larp_model.physics.motion import BodyMotion, Constants
 from larp_model.scene import Scene
 from larp_model.simulator import step
-from larp_model.truth.episodes import Episodes
 from tasks.scenarios import scenario
 
 SOON = {"xla_backend_optimization_level": 0}
@@ -151,15 +151,17 @@ def test_networks_change_what_physics_says(case: Case) -> None:
 
 
 def test_changes_say_all_of_a_motion(episodes: Episodes) -> None:
-    before, after = (jnp.asarray(episodes.states[:, step, :-1], jnp.float64) for step in (10, 11))
-    motion, dt = true_motion(before, after), 0.01
-    velocity, spin, moved, turned = jnp.moveaxis(changes(before, motion, dt), 1, 0)
-    ends = packed.velocity(before) + velocity, packed.angular_velocity(before) + spin
+    scene, dt = scenario("human_ball").scene.only("human"), 0.01
+    before, after = (jnp.moveaxis(jnp.asarray(episodes.states[:, step, :-1], jnp.float64), 0, -1) for step in (10, 11))
+    seen = kinematics(scene, before, jnp.moveaxis(jnp.asarray(episodes.morphology[:, :-1], jnp.float64), 0, -1))
+    motion = true_motion(seen, after)
+    velocity, spin, moved, turned = changes(seen, motion, dt)
+    ends = seen.velocity + velocity, seen.angular_velocity + spin
     again = BodyMotion(
         *ends,
-        0.5 * dt * (packed.velocity(before) + ends[0]) + moved,
-        0.5 * dt * (packed.angular_velocity(before) + ends[1]) + turned,
+        0.5 * dt * (seen.velocity + ends[0]) + moved,
+        0.5 * dt * (seen.angular_velocity + ends[1]) + turned,
     )
     for one, other in zip(again, motion, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)
-    np.testing.assert_allclose(packed.position(before) + again.moved, packed.position(after), atol=1e-12)
+    np.testing.assert_allclose(seen.position + again.moved, after[:, packed.POSITION], atol=1e-12)

@@ -13,12 +13,13 @@ import pytest
 from jax import Array
 from scipy.spatial.transform import Rotation
 
-from larp_model import kinematics, rotation
+from larp_model import rotation
 from larp_model import state as packed
 from larp_model.bodies import capsule, chain, human, human_and_ball
-from larp_model.physics.motion import GAMMA, BodyMotion, Constants, free_motion, moments
+from larp_model.engines.mujoco import Truth, closed, compile_model
+from larp_model.physics import kinematics
+from larp_model.physics.motion import GAMMA, BodyMotion, Constants, articulated_motion, moments
 from larp_model.scene import Body, Scene
-from larp_model.truth.mujoco import Truth, closed, compile_model
 from tasks.motions.references import standing_on_ground
 from tasks.scenarios import scenario
 from tasks.thrown import thrown_episodes, thrown_starts
@@ -53,6 +54,16 @@ def starts(body: Body) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     states[..., 2] = HIGH
     controls = 0.3 * random.standard_normal((COUNT, len(body.motors), 3))
     return closed(Scene((body,)), states), controls, 0.5 * random.standard_normal((COUNT, links, 3))
+
+
+def free_motion(
+    body: Body, state: Array, control: Array, torque: Array, morphology: Array, gravity: float, dt: float
+) -> BodyMotion:
+    """`articulated_motion` with the batch first: states (N, n, 13), morphologies (N or 1, n, 3)."""
+    before, targets, outside, sizes = (jnp.moveaxis(each, 0, -1) for each in (state, control, torque, morphology))
+    seen = kinematics.kinematics(Scene((body,)), before, sizes)
+    motion, _ = articulated_motion(body, seen, targets, outside, gravity, dt)
+    return BodyMotion(*(jnp.moveaxis(each, -1, 0) for each in motion))
 
 
 def motion_of(

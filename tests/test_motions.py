@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from larp_model import kinematics
 from larp_model import state as packed
 from larp_model.bodies import human, human_and_ball
+from larp_model.engines.mujoco import Truth
 from larp_model.meeting import first_contacts
+from larp_model.physics import kinematics
 from larp_model.scene import Body
-from larp_model.truth.mujoco import Truth
 from tasks.motions import references, styles
 from tasks.motions.details import in_detail
 from tasks.motions.generator import any_episodes, in_motion, planted

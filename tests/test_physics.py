@@ -14,18 +14,19 @@ from jax import Array
 from larp_model import launches
 from larp_model import state as packed
 from larp_model.bodies import BALL_SURFACE, ball, capsule, chain, human, two_balls
+from larp_model.engines.mujoco import FINE_SUBSTEPS, Truth, closed, compile_model
 from larp_model.learned.residual import ResidualModel
 from larp_model.networks import Weights
 from larp_model.physics import contact
 from larp_model.physics import step as physics
 from larp_model.physics.articulated import Momenta
 from larp_model.physics.collision import ContactSettings
+from larp_model.physics.kinematics import kinematics
 from larp_model.physics.motion import articulated_motion
 from larp_model.physics.response import Gains, responses
 from larp_model.scene import Body, Pair, Scene
 from larp_model.simulator import Simulator
 from larp_model.simulator import step as simulator_step
-from larp_model.truth.mujoco import FINE_SUBSTEPS, Truth, closed, compile_model
 from tasks.data import random_episodes
 from tasks.motions.references import Reference
 
@@ -155,7 +156,7 @@ def test_impulses_are_answered_at_once_as_the_engines_inertia_says(body: Body, i
         state, pushes = (jnp.moveaxis(each, 0, -1) for each in (states, push))
         sizes = jnp.broadcast_to(jnp.asarray(scene.morphology)[..., None], (links, 3, count))
         targets, still = jnp.zeros((len(body.motors), 3, count)), jnp.zeros((links, 3, count))
-        _, articulation = articulated_motion(body, state, targets, still, sizes, 0.0, 1e-9)
+        _, articulation = articulated_motion(body, kinematics(scene, state, sizes), targets, still, 0.0, 1e-9)
         momenta = Momenta(*(each[:, :, None] for each in (pushes[:, 3:], pushes[:, :3])))
         kept, fading = responses(body, articulation, momenta, sizes, 0.003)
         return Gains(*(jnp.moveaxis(a + b, -1, 0)[..., 0] for a, b in zip(kept, fading, strict=True)))

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from larp_model.bodies import human_and_ball
+from larp_model.engines.mujoco import Truth
 from larp_model.errors import InputError
-from larp_model.truth.mujoco import Truth
 from mpc import MujocoDynamics, Verified
 from mpc.gauss_newton import FACTORS
 from tasks import pose

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from larp_model import kinematics
 from larp_model.anatomy import ANATOMIES, Detail
 from larp_model.bodies import ball, capsule, chain, detail_of, human, human_and_ball, standing_height, usual
 from larp_model.errors import InputError
+from larp_model.physics import kinematics
 from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface, anchor
 
 NAN, INFINITY = math.nan, math.inf
@@ -148,8 +148,9 @@ def test_anchors_scale_with_the_morphology(length: float, radius: float) -> None
         scaled = anchor(point, np.array(length * link.length), np.array(radius * link.radius), link.axis)
         along = np.abs(link.axis) > 0.5
         np.testing.assert_allclose(scaled, np.where(along, length, radius) * still, atol=1e-12)
-        shape = jnp.array([[length * link.length, radius * link.radius, link.mass]])
-        np.testing.assert_allclose(kinematics.anchors([point], [link.axis], shape)[0], scaled, atol=1e-6)
+        sizes = jnp.array([[length * link.length, radius * link.radius, link.mass]])[..., None]
+        local = kinematics.local_anchors(Scene((Body("one", "one", (link,)),)), np.array([0]), [point], sizes)
+        np.testing.assert_allclose(local[0, :, 0], scaled, atol=1e-6)
 
 
 @IN_DETAIL

@@ -8,11 +8,11 @@ import pytest
 
 from larp_model import state as packed
 from larp_model.bodies import human_and_ball
+from larp_model.engines.episodes import Episodes, record
+from larp_model.engines.mujoco import Truth, closed
 from larp_model.meeting import first_contacts, meetings
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
-from larp_model.truth.episodes import Episodes, record
-from larp_model.truth.mujoco import Truth, closed
 from tasks.data import overlaps
 from tasks.motions.generator import any_episodes
 from tasks.motions.references import Reference

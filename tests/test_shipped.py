@@ -9,13 +9,13 @@ import pytest
 from larp_model import evaluation
 from larp_model import state as packed
 from larp_model.bodies import human_and_ball
-from larp_model.kinematics import displacement, morphology_of
+from larp_model.engines.episodes import Episodes
 from larp_model.launches import launches_of
 from larp_model.learned.residual import ResidualModel
 from larp_model.networks import Size
+from larp_model.physics.kinematics import displacement, morphology_of
 from larp_model.simulator import Simulator
 from larp_model.training import Recipe, Windows, statistics_of
-from larp_model.truth.episodes import Episodes
 from tasks.live import NOVEL
 from tasks.motions.references import Reference
 from tasks.scenarios import scenario

@@ -16,17 +16,17 @@ from larp_model import losses, rotation
 from larp_model import state as packed
 from larp_model.anatomy import Detail
 from larp_model.bodies import BALL_SURFACE, capsule, chain, human_and_ball
+from larp_model.engines.episodes import Episodes
 from larp_model.errors import InputError
-from larp_model.kinematics import morphology_of
 from larp_model.learned.model import Model
 from larp_model.learned.residual import ResidualModel
 from larp_model.losses import LossWeights
 from larp_model.meeting import first_contacts
 from larp_model.networks import Size, Weights
 from larp_model.physics.ball import SUBSTEPS
+from larp_model.physics.kinematics import morphology_of
 from larp_model.scene import Pair, Scene
 from larp_model.simulator import Simulator, rollout, step
-from larp_model.truth.episodes import Episodes
 
 STEPS = 10
 

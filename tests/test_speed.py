@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from larp_model.engines.mujoco import Truth
 from larp_model.errors import InputError
-from larp_model.kinematics import morphology_of
 from larp_model.meeting import meetings
+from larp_model.physics.kinematics import morphology_of
 from larp_model.scene import Scene
-from larp_model.truth.mujoco import Truth
 from tasks.benchmarks import engines, replays, report, speed
 from tasks.benchmarks.engines import Course, Question, Refused
 from tasks.motions.references import Reference

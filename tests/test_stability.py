@@ -13,12 +13,12 @@ import pytest
 
 from larp_model import state as packed
 from larp_model.bodies import ball
+from larp_model.engines.mujoco import Truth
 from larp_model.errors import InputError
 from larp_model.learned.model import Model
 from larp_model.networks import Weights
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
-from larp_model.truth.mujoco import Truth
 from mpc import CEM, Gradient
 from mpc.loop import Diverged, Phase, Window, execute
 from tasks.benchmarks import pushes, slopes, stability

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from larp_model.truth.mujoco import SUBSTEPS, Truth
+from larp_model.engines.mujoco import SUBSTEPS, Truth
 from tasks import tried
 from tasks.kick import Kick
 from tasks.tried import tried_episodes

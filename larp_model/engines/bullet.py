@@ -33,9 +33,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
+from larp_model.engines.mujoco import SUBSTEPS, finite
 from larp_model.errors import InputError
 from larp_model.scene import Body, Link, Scene, Surface, Vector, anchor
-from larp_model.truth.mujoco import SUBSTEPS, finite
 
 HARD = 1e18  # stiffness of what does not give way [N/m]
 FASTEST = 1e4  # Bullet cuts velocities of joints at 100 unless told otherwise [m/s, rad/s]
@@ -329,7 +329,7 @@ def _rotation_vector(quaternion: np.ndarray) -> np.ndarray:
 
 
 class BulletTruth:
-    """A batch of simulations of one scene, one world after the other; see `larp_model.truth.mujoco.Truth`."""
+    """A batch of simulations of one scene, one world after the other; see `larp_model.engines.mujoco.Truth`."""
 
     def __init__(self, scene: Scene, batch: int = 1, substeps: int = SUBSTEPS) -> None:
         """batch: simulations side by side. substeps: engine steps in one `scene.dt`, each with its own torques."""

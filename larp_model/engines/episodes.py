@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from larp_model import state as packed
+from larp_model.engines.mujoco import Truth
 from larp_model.errors import InputError
 from larp_model.files import written_whole
 from larp_model.scene import Scene
-from larp_model.truth.mujoco import Truth
 
 VERSION = 2
 

@@ -15,9 +15,9 @@ from jax import Array
 
 from larp_model import contact, meeting, rotation
 from larp_model import state as packed
-from larp_model.kinematics import Kinematics, kinematics
 from larp_model.learned.model import network_name
 from larp_model.networks import Measured, Perceptron, Size, Statistics, Weights, bounded, evaluate, side_by_side
+from larp_model.physics.kinematics import Kinematics, kinematics
 from larp_model.scene import Body, Pair, Scene
 
 # Weight of links that are apart in a contact network's statistics, for where none are near.
@@ -70,7 +70,7 @@ class PaperModel:
     ) -> Array:
         """See `Model`: f_d of each body sees the sum of f_c over the contacts of its links (equation 1)."""
         scene, networks = self.scene, self.networks()
-        seen = kinematics(scene, state, morphology)
+        seen = kinematics(scene, jnp.moveaxis(state, 0, -1), jnp.moveaxis(morphology, 0, -1))
         by_body = {body.name: seen.of(scene, body.name) for body in scene.bodies}
         pushes = {
             body.name: jnp.zeros((*state[:, scene.rows(body.name)].shape[:2], 6), state.dtype) for body in scene.bodies
@@ -92,15 +92,17 @@ class PaperModel:
             outputs = bounded(evaluate(networks[name], weights, name, inputs), self.bound)
             velocities = weights.outputs[name].restore(outputs).reshape(len(state), 2, len(body.links), 3)
             velocity, spin = velocities[:, 0], velocities[:, 1]
-            position = packed.position(own.state) + scene.dt * velocity
-            turned = rotation.integrate(packed.orientation(own.state), scene.dt * spin)
+            before = state[:, rows]
+            position = packed.position(before) + scene.dt * velocity
+            turned = rotation.integrate(packed.orientation(before), scene.dt * spin)
             after.append(packed.pack(position, turned, velocity, spin))
         return jnp.concatenate(after, axis=1)
 
     def measure(self, before: Array, after: Array, control: Array, torque: Array, morphology: Array) -> Measured:
         """See `Model`; of contacts where links are near, for elsewhere they count for nothing."""
         scene = self.scene
-        seen, measured = kinematics(scene, before, morphology), Measured()
+        seen = kinematics(scene, jnp.moveaxis(before, 0, -1), jnp.moveaxis(morphology, 0, -1))
+        measured = Measured()
         for body in scene.bodies:
             rows, motors = scene.rows(body.name), scene.motor_rows(body.name)
             inputs = body_inputs(body, seen.of(scene, body.name), control[:, motors], torque[:, rows])
@@ -110,7 +112,9 @@ class PaperModel:
         for pair, both in pairs_by_kind(scene):
             own = seen.of(scene, pair.first), seen.of(scene, pair.second)
             features = jnp.concatenate(contact_inputs(pair, both, own), axis=1)
-            met = meeting.meet(pair, both, own, (own[0].state, own[1].state), scene.dt)
+            met = meeting.meet(
+                pair, both, own, (before[:, scene.rows(pair.first)], before[:, scene.rows(pair.second)]), scene.dt
+            )
             near = jnp.tile(met.near, (1, 2)).reshape(-1) + APART
             measured[network_name("contact", *both)] = (
                 Statistics.of(features.reshape(-1, features.shape[-1]), near), None
@@ -131,18 +135,17 @@ def body_inputs(body: Body, seen: Kinematics, control: Array, torque: Array) -> 
     Root-relative position, rotation matrix, velocities, displacement, torque; height, target quaternion, length and
     radius.
     """
-    state, size, links = seen.state, seen.state.shape[0], len(body.links)
-    position = packed.position(state)
     vectors = [
-        position - position[:, :1],
-        jnp.moveaxis(seen.matrices, -1, -2).reshape(size, 3 * links, 3),
-        packed.velocity(state),
-        packed.angular_velocity(state),
+        seen.position - seen.position[:1],
+        jnp.swapaxes(seen.matrices, 1, 2).reshape(-1, *seen.position.shape[1:]),
+        seen.velocity,
+        seen.angular_velocity,
         seen.displacement,
-        torque,
     ]
-    sizes = jnp.broadcast_to(seen.morphology[..., :2], (size, links, 2))
-    return side_by_side(*vectors, position[..., 2], rotation.from_rotation_vector(control), sizes)
+    before, height, sizes = (
+        jnp.moveaxis(each, -1, 0) for each in (jnp.concatenate(vectors), seen.position[:, 2], seen.sizes[:, :2])
+    )
+    return side_by_side(before, torque, height, rotation.from_rotation_vector(control), sizes)
 
 
 def contact_inputs(pair: Pair, bodies: tuple[Body, Body], seen: tuple[Kinematics, Kinematics]) -> tuple[Array, Array]:
@@ -152,16 +155,17 @@ def contact_inputs(pair: Pair, bodies: tuple[Body, Body], seen: tuple[Kinematics
     point relative to the link, the normal and the distance, when the step begins.
     """
     rows = meeting.rows_of(pair, *bodies)
-    found = contact.closest(*(own.segments(links) for own, links in zip(seen, rows, strict=True)))
-    root = seen[0].state[:, :1, :3] * jnp.array([1.0, 1.0, 0.0], seen[0].state.dtype)
+    found = contact.closest(*(meeting.segments(own, links) for own, links in zip(seen, rows, strict=True)))
+    root = seen[0].position[:1] * jnp.array([[1.0], [1.0], [0.0]], seen[0].state.dtype)
 
-    def phi(own: Kinematics, links: np.ndarray) -> Array:
-        sizes = jnp.broadcast_to(own.morphology[:, links], (own.state.shape[0], len(links), 3))
-        state = own.state[:, links]
-        return jnp.concatenate([packed.position(state) - root, state[..., 3:], sizes], axis=-1)
+    def phi(own: Kinematics, links: np.ndarray) -> tuple[Array, Array]:
+        """Return the links' features (B, P, F), and where they are (B, P, 3) [m]."""
+        features = jnp.concatenate([own.position - root, own.state[:, 3:], own.sizes], axis=1)
+        by_link, places = (jnp.moveaxis(each[links], -1, 0) for each in (features, own.position))
+        return by_link, places
 
-    (first, second), distance = (phi(*each) for each in zip(seen, rows, strict=True)), found.distance[..., None]
-    arms = (found.point - packed.position(own.state)[:, links] for own, links in zip(seen, rows, strict=True))
-    by_first = jnp.concatenate([first, second, next(arms), found.normal, distance], axis=-1)
-    by_second = jnp.concatenate([second, first, next(arms), -found.normal, distance], axis=-1)
+    (first, at_first), (second, at_second) = (phi(*each) for each in zip(seen, rows, strict=True))
+    distance = found.distance[..., None]
+    by_first = jnp.concatenate([first, second, found.point - at_first, found.normal, distance], axis=-1)
+    by_second = jnp.concatenate([second, first, found.point - at_second, -found.normal, distance], axis=-1)
     return by_first, by_second

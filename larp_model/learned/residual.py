@@ -12,11 +12,12 @@ from jax import Array
 
 from larp_model import rotation
 from larp_model import state as packed
-from larp_model.kinematics import Kinematics, apply, ends_on_ground, kinematics
 from larp_model.learned.model import network_name
+from larp_model.linalg import mv
 from larp_model.networks import Measured, Perceptron, Size, Statistics, Weights, bounded, evaluate, side_by_side
 from larp_model.physics.collision import ContactSettings
-from larp_model.physics.motion import BodyMotion, Constants, free_motion
+from larp_model.physics.kinematics import Kinematics, ends_on_ground, kinematics
+from larp_model.physics.motion import BodyMotion, Constants, articulated_motion
 from larp_model.physics.step import step as physics_step
 from larp_model.scene import Body, Scene
 
@@ -56,27 +57,24 @@ class ResidualModel:
     ) -> Array:
         """See `Model`; no contact has a network, so that there are no inputs to hold fixed."""
 
-        def correct(body: Body, before: Array, sizes: Array, motion: BodyMotion, dt: float) -> BodyMotion:
-            if self.size is None or body.is_ball:
-                return motion
-            seen = kinematics(self.scene.only(body.name), *(jnp.moveaxis(each, -1, 0) for each in (before, sizes)))
-            corrected = self._corrected(body, weights, seen, BodyMotion(*(jnp.moveaxis(m, -1, 0) for m in motion)), dt)
-            return BodyMotion(*(jnp.moveaxis(each, 0, -1) for each in corrected))
+        def correct(body: Body, seen: Kinematics, motion: BodyMotion, dt: float) -> BodyMotion:
+            known = self.size is None or body.is_ball
+            return motion if known else self._corrected(body, weights, seen, motion, dt)
 
         return physics_step(self.scene, state, control, torque, morphology, self.constants, self.contacts, correct)
 
     def _corrected(self, body: Body, weights: Weights, seen: Kinematics, motion: BodyMotion, dt: float) -> BodyMotion:
-        """Return the motion within `dt` [s], (B, n, 3), as the network knows better."""
+        """Return the motion (n, 3, B) within `dt` [s] as the network corrects it."""
         name = network_name("dynamics", body)
         turn, inputs = network_inputs(body, seen, motion, dt)
         outputs = weights.outputs[name].restore(self.answer(weights, name, inputs))
         vectors = rotation.about_z(outputs.reshape(len(inputs), -1, 3), turn[:, None])
         # Of a shorter step it is that share.
         added = dt / self.scene.dt * vectors.reshape(len(inputs), 4, -1, 3)
-        velocity, spin = added[:, 0], added[:, 1]
+        velocity, spin, moved, turned = (jnp.moveaxis(added[:, part], 0, -1) for part in range(4))
         return BodyMotion(
             motion.velocity + velocity, motion.spin + spin,
-            motion.moved + 0.5 * dt * velocity + added[:, 2], motion.turned + 0.5 * dt * spin + added[:, 3],
+            motion.moved + 0.5 * dt * velocity + moved, motion.turned + 0.5 * dt * spin + turned,
         )  # fmt: skip
 
     def measure(self, before: Array, after: Array, control: Array, torque: Array, morphology: Array) -> Measured:
@@ -93,17 +91,22 @@ class ResidualModel:
         know.
         """
         scene, dt, found = self.scene, self.scene.dt, []
+        state, end, targets, torques, sizes = (
+            jnp.moveaxis(each, 0, -1) for each in (before, after, control, torque, morphology)
+        )
+        whole = kinematics(scene, state, sizes)
         for body in scene.bodies if self.size else ():
             if body.is_ball:
                 continue
-            rows = scene.rows(body.name)
-            seen = kinematics(scene.only(body.name), before[:, rows], morphology[:, rows])
-            targets, torques = control[:, scene.motor_rows(body.name)], torque[:, rows]
-            motion = free_motion(body, seen.state, targets, torques, seen.morphology, scene.gravity, dt, self.constants)
+            rows, seen, name = scene.rows(body.name), whole.of(scene, body.name), network_name("dynamics", body)
+            motion, _ = articulated_motion(
+                body, seen, targets[scene.motor_rows(body.name)], torques[rows], scene.gravity, dt, self.constants
+            )
             turn, inputs = network_inputs(body, seen, motion, dt)
-            left = changes(seen.state, true_motion(seen.state, after[:, rows]), dt) - changes(seen.state, motion, dt)
-            outputs = rotation.about_z(left.reshape(len(after), -1, 3), rotation.opposite(turn)[:, None])
-            found.append((network_name("dynamics", body), inputs, outputs.reshape(len(after), -1)))
+            lacking = changes(seen, true_motion(seen, end[rows]), dt) - changes(seen, motion, dt)
+            vectors = jnp.moveaxis(lacking, -1, 0).reshape(len(after), -1, 3)
+            outputs = rotation.about_z(vectors, rotation.opposite(turn)[:, None])
+            found.append((name, inputs, outputs.reshape(len(after), -1)))
         return found
 
     def answer(self, weights: Weights, name: str, inputs: Array) -> Array:
@@ -113,34 +116,35 @@ class ResidualModel:
 
 def network_inputs(body: Body, seen: Kinematics, motion: BodyMotion, dt: float) -> tuple[Array, Array]:
     """Return the frame of a body's network, cosine and sine (B, 2), and its inputs (B, F)."""
-    state, links = seen.state, body.links
-    turn = rotation.course(packed.orientation(state)[:, 0], links[0].axis)
-    position, axes = packed.position(state), jnp.array([link.axis for link in links], state.dtype)
+    turn = rotation.course(seen.orientation[0].T, body.links[0].axis)
+    axes = jnp.array([link.axis for link in body.links], seen.state.dtype)[..., None]
     velocities, ends = ends_on_ground(seen, motion.velocity, motion.spin, dt)
     vectors = [
-        position - position[:, :1], apply(seen.matrices, axes), motion.velocity, motion.spin, seen.displacement,
+        seen.position - seen.position[:1], mv(seen.matrices, axes), motion.velocity, motion.spin, seen.displacement,
         velocities,
     ]  # fmt: skip
-    turned = rotation.about_z(jnp.concatenate(vectors, axis=1), rotation.opposite(turn)[:, None])
-    sizes = jnp.broadcast_to(seen.morphology, (state.shape[0], len(links), 3))
-    return turn, side_by_side(turned, position[..., 2], sizes, ends)
+    turned = rotation.about_z(jnp.moveaxis(jnp.concatenate(vectors), -1, 0), rotation.opposite(turn)[:, None])
+    rest = seen.position[:, 2], seen.sizes, ends
+    return turn, side_by_side(turned, *(jnp.moveaxis(each, -1, 0) for each in rest))
 
 
-def true_motion(state: Array, after: Array) -> BodyMotion:
-    """Return the motion (B, n, 3) that leads from states (B, n, 13) to others."""
-    relative = rotation.multiply(packed.orientation(after), rotation.conjugate(packed.orientation(state)))
-    moved = packed.position(after) - packed.position(state)
-    return BodyMotion(
-        packed.velocity(after), packed.angular_velocity(after), moved, rotation.to_rotation_vector(relative)
-    )
+def true_motion(seen: Kinematics, after: Array) -> BodyMotion:
+    """Return the motion (n, 3, B) that leads from the states that are seen to others (n, 13, B)."""
+    before, after = (jnp.moveaxis(each, -1, 0) for each in (seen.state, after))
+    relative = rotation.multiply(packed.orientation(after), rotation.conjugate(packed.orientation(before)))
+    motion = BodyMotion(
+        packed.velocity(after), packed.angular_velocity(after),
+        packed.position(after) - packed.position(before), rotation.to_rotation_vector(relative),
+    )  # fmt: skip
+    return BodyMotion(*(jnp.moveaxis(each, 0, -1) for each in motion))
 
 
-def changes(state: Array, motion: BodyMotion, dt: float) -> Array:
-    """Return a motion of states (B, n, 13) as changes (B, 4, n, 3), what networks add to.
+def changes(seen: Kinematics, motion: BodyMotion, dt: float) -> Array:
+    """Return a motion as changes (4, n, 3, B), what networks add to.
 
     Of velocity [m/s] and spin [rad/s], and corrections [m, rad] of the trapezoidal step x' = x + (v + v') dt / 2.
     """
-    velocity, spin = packed.velocity(state), packed.angular_velocity(state)
+    velocity, spin = seen.velocity, seen.angular_velocity
     moved = motion.moved - 0.5 * dt * (velocity + motion.velocity)
     turned = motion.turned - 0.5 * dt * (spin + motion.spin)
-    return jnp.stack([motion.velocity - velocity, motion.spin - spin, moved, turned], axis=1)
+    return jnp.stack([motion.velocity - velocity, motion.spin - spin, moved, turned])

@@ -19,6 +19,7 @@ import numpy as np
 from jax import Array
 
 from larp_model.linalg import barrier, cross, cross_columns, cross_rows, inverse, inverse_cholesky, mm, mv
+from larp_model.physics.kinematics import Anchors
 from larp_model.scene import Body
 
 
@@ -35,13 +36,6 @@ class Momenta(NamedTuple):
 
     turning: Array
     moving: Array
-
-
-class Anchors(NamedTuple):
-    """Joints by their children and by their parents, (n - 1, 3, B) each."""
-
-    child: Array
-    parent: Array
 
 
 class Level(NamedTuple):

@@ -11,30 +11,27 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from larp_model import state as packed
 from larp_model.contact import IMPEDANCE
 from larp_model.physics.contact import stuck_or_sliding
+from larp_model.physics.kinematics import Kinematics
 from larp_model.physics.motion import BodyMotion, moments
 from larp_model.scene import Body
 
 SUBSTEPS = 20
 
 
-def ball_motion(body: Body, state: Array, outside: Array, sizes: Array, gravity: float, dt: float) -> BodyMotion:
-    """Return how a ball in states (1, 13, B) moves on within `dt` [s] if nothing but the ground touches it.
-
-    outside (1, 3, B) [N m], sizes (1, 3, B).
-    """
+def ball_motion(body: Body, seen: Kinematics, outside: Array, gravity: float, dt: float) -> BodyMotion:
+    """Return how a ball moves on within `dt` [s] if nothing but the ground touches it; outside (1, 3, B) [N m]."""
     surface, h = body.surface, dt / SUBSTEPS
-    radius, light = sizes[0, 1], 1.0 / sizes[0, 2]
-    turns = 1.0 / moments(*(sizes[0, column] for column in range(3)))[0]
+    length, radius, mass = seen.sizes[0]
+    light, turns, height = 1.0 / mass, 1.0 / moments(length, radius, mass)[0], seen.position[0, 2] - radius
     soft = (1.0 - IMPEDANCE) / IMPEDANCE * light  # R of `physics.contact`
     damped = 1.0 - h * surface.damping / IMPEDANCE
     twist = h * turns * outside[0]
 
     def substep(now: tuple[Array, ...], nothing: None) -> tuple[tuple[Array, ...], None]:
         x, y, z, vx, vy, vz, wx, wy, wz = now
-        gap = z - radius
+        gap = height + z
         lever = radius + 0.5 * gap  # contact points are midway between the surfaces
         along, across = light, light + turns * lever**2
         # u_ref - u_free: across, what the lowest point loses by damping; along, what the spring gives as well.
@@ -49,28 +46,27 @@ def ball_motion(body: Body, state: Array, outside: Array, sizes: Array, gravity:
         wx, wy, wz = wx + twist[0] + turns * lever * jy, wy + twist[1] - turns * lever * jx, wz + twist[2]
         return (x + h * vx, y + h * vy, z + h * vz, vx, vy, vz, wx, wy, wz), None
 
-    position, velocity, spin = (
-        state[:, columns] for columns in (packed.POSITION, packed.VELOCITY, packed.ANGULAR_VELOCITY)
-    )
+    velocity, spin = seen.velocity, seen.angular_velocity
 
     def on_the_ground() -> BodyMotion:
-        after, _ = jax.lax.scan(substep, (*position[0], *velocity[0], *spin[0]), length=SUBSTEPS)
-        place, moving, turning = (jnp.stack(after[begin : begin + 3])[None] for begin in (0, 3, 6))
-        return BodyMotion(moving, turning, place - position, 0.5 * dt * (spin + turning))
+        still = jnp.zeros_like(velocity[0])
+        after, _ = jax.lax.scan(substep, (*still, *velocity[0], *spin[0]), length=SUBSTEPS)
+        moved, moving, turning = (jnp.stack(after[begin : begin + 3])[None] for begin in (0, 3, 6))
+        return BodyMotion(moving, turning, moved, 0.5 * dt * (spin + turning))
 
-    lowest = position[0, 2] - radius + jnp.minimum(dt * velocity[0, 2] - dt**2 * gravity, 0.0)
+    lowest = height + jnp.minimum(dt * velocity[0, 2] - dt**2 * gravity, 0.0)
     return jax.lax.cond(
-        jnp.any(lowest < 0.0), on_the_ground, lambda: flight(body, state, outside, sizes, gravity, dt, SUBSTEPS)
+        jnp.any(lowest < 0.0), on_the_ground, lambda: flight(body, seen, outside, gravity, dt, SUBSTEPS)
     )
 
 
 def flight(
-    body: Body, state: Array, outside: Array, sizes: Array, gravity: float, dt: float, substeps: float = math.inf
+    body: Body, seen: Kinematics, outside: Array, gravity: float, dt: float, substeps: float = math.inf
 ) -> BodyMotion:
     """Return `ball_motion` of a ball that nothing touches, as so many substeps have it."""
-    velocity, spin = state[:, packed.VELOCITY], state[:, packed.ANGULAR_VELOCITY]
-    falling = jnp.array([0.0, 0.0, -gravity], state.dtype)[:, None]
-    turns = 1.0 / moments(*(sizes[:, column : column + 1] for column in range(3)))[0]
+    velocity, spin = seen.velocity, seen.angular_velocity
+    falling = jnp.array([0.0, 0.0, -gravity], velocity.dtype)[:, None]
+    turns = 1.0 / moments(*(seen.sizes[:, column : column + 1] for column in range(3)))[0]
     turning = spin + dt * turns * outside
     fallen = dt * velocity + 0.5 * dt * (dt + dt / substeps) * falling
     return BodyMotion(velocity + dt * falling, turning, fallen, 0.5 * dt * (spin + turning))

@@ -16,6 +16,7 @@ from jax import Array
 
 from larp_model.contact import Axis, nearest
 from larp_model.linalg import cross
+from larp_model.physics.kinematics import Kinematics
 from larp_model.scene import Scene, Surface
 from larp_model.vector import Vector
 
@@ -37,25 +38,19 @@ class ContactSettings:
     moments: int = 5
 
 
-class Links(NamedTuple):
-    """All links of a scene in a step: position, half axis [m], velocity and spin when it begins, (L, 3, B) each.
+class Rates(NamedTuple):
+    """How the links of a scene accelerate in a step in which no other link touches them, (L, 3, B) each.
 
-    acceleration, turning: mean ones [m/s^2, rad/s^2] if nothing touches, which change by jerk, angular_jerk [m/s^3,
-    rad/s^3]. uncounted, uncounted_turning: accelerations that contacts do not count, see `motion.velocity_products`.
-    sizes: (L, 3, B).
+    acceleration [m/s^2], angular_acceleration [rad/s^2]: mean ones, which change by jerk, angular_jerk [m/s^3,
+    rad/s^3]. uncounted, uncounted_angular: parts of them that contacts do not count, see `motion.velocity_products`.
     """
 
-    position: Array
-    half: Array
-    velocity: Array
-    spin: Array
     acceleration: Array
-    turning: Array
+    angular_acceleration: Array
     jerk: Array
     angular_jerk: Array
     uncounted: Array
-    uncounted_turning: Array
-    sizes: Array
+    uncounted_angular: Array
 
 
 @dataclass(frozen=True)
@@ -87,17 +82,17 @@ class Candidates:
         """Return the names of the balls."""
         return tuple(body.name for body in self.scene.bodies if body.is_ball)
 
-    def gaps(self, links: Links, dt: float, settings: ContactSettings) -> Array:
-        """Return the smallest gap (P, B) [m] of every pair within a step in which nothing touches."""
+    def gaps(self, seen: Kinematics, rates: Rates, dt: float, settings: ContactSettings) -> Array:
+        """Return the smallest gap (P, B) [m] of every pair of links within `dt` [s], as they accelerate on average."""
         first, second = self.rows
 
         def at(time: Array) -> Array:
-            swept = time * (links.velocity + 0.5 * time * links.acceleration)
-            half = turned(links.half, time * (links.spin + 0.5 * time * links.turning))
-            one, two = (((links.position + swept)[rows], half[rows], links.sizes[rows, 1]) for rows in (first, second))
+            position = seen.position + time * (seen.velocity + 0.5 * time * rates.acceleration)
+            half = turned(seen.half, time * (seen.angular_velocity + 0.5 * time * rates.angular_acceleration))
+            one, two = ((position[rows], half[rows], seen.sizes[rows, 1]) for rows in (first, second))
             return closest(one, two)[1]
 
-        times = jnp.linspace(0.0, dt, settings.moments, dtype=links.position.dtype)
+        times = jnp.linspace(0.0, dt, settings.moments, dtype=seen.state.dtype)
         return jnp.min(jax.lax.map(at, times), axis=0)
 
 

@@ -18,8 +18,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from larp_model.linalg import barrier, cross, cross_columns, cross_rows, mv
-from larp_model.physics.articulated import Anchors, Inertia, Momenta, levels_of, solve
+from larp_model.physics.articulated import Inertia, Momenta, levels_of, solve
 from larp_model.physics.contact import projection
+from larp_model.physics.kinematics import Anchors
 from larp_model.scene import Body
 
 # Newton's method ends where no impulse is further off, as a share of the body's largest and in units of the precision:

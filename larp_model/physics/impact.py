@@ -22,25 +22,14 @@ from larp_model.contact import IMPEDANCE
 from larp_model.linalg import cross, cross_columns, cross_rows, mv
 from larp_model.physics import contact
 from larp_model.physics.articulated import Momenta
-from larp_model.physics.collision import Candidates, ContactSettings, Links, Sides, closest, picked, sides_of, turned
+from larp_model.physics.collision import Candidates, ContactSettings, Rates, Sides, closest, picked, sides_of, turned
 from larp_model.physics.contact import ContactProblem
-from larp_model.physics.motion import Articulation, moments
+from larp_model.physics.kinematics import Kinematics
+from larp_model.physics.motion import Articulation, BodyMotion, moments
 from larp_model.physics.response import responses
 from larp_model.scene import Scene, Surface
 
 UP = np.array([0.0, 0.0, 1.0])[None, :, None]
-
-
-class Gained(NamedTuple):
-    """Changes that contacts add to all links in a step, (L, 3, B) each.
-
-    velocity [m/s] and spin [rad/s] at its end; moved [m] and turned [rad] during it.
-    """
-
-    velocity: Array
-    spin: Array
-    moved: Array
-    turned: Array
 
 
 class SideStates(NamedTuple):
@@ -68,13 +57,14 @@ Totals = tuple[tuple[Array, Array], tuple[Array, Array]]
 
 def integrate(
     scene: Scene,
-    links: Links,
+    seen: Kinematics,
+    rates: Rates,
     articulations: dict[str, Articulation],
     gaps: Array,
     dt: float,
     settings: ContactSettings,
-) -> Gained:
-    """Return what contacts within `dt` [s] do to all links of a scene; see the module.
+) -> BodyMotion:
+    """Return what contacts within `dt` [s] add to the motion (L, 3, B) of all links; see the module.
 
     articulations: of the articulated bodies by name. gaps: (P, B), see `Candidates.gaps`.
     """
@@ -83,19 +73,19 @@ def integrate(
     chosen = jax.nn.one_hot(jnp.argsort(gaps, axis=0)[:count], len(gaps), axis=1, dtype=gaps.dtype)
     sides = sides_of(candidates, chosen)
     spread = {
-        name: _spread(scene, name, articulation, sides, links.sizes, settings)
+        name: _spread(scene, name, articulation, sides, seen.sizes, settings)
         for name, articulation in articulations.items()
         if any(name in owners for owners in sides.owners)
     }
-    totals = System(candidates, links, chosen, sides, spread, dt, settings).run()
+    totals = System(candidates, seen, rates, chosen, sides, spread, dt, settings).run()
     parts = []
     for body in scene.bodies:
         rows = scene.rows(body.name)
         if body.is_ball:
-            light, turns = _looseness(links.sizes[rows])
+            light, turns = _looseness(seen.sizes[rows])
             on = sides.which[:, rows.start][:, None]
             (v, w), (x, t) = ((jnp.sum(on * f[0], axis=0), jnp.sum(on * m[0], axis=0)) for f, m in totals)
-            parts.append(Gained(light * v[None], turns * w[None], light * x[None], turns * t[None]))
+            parts.append(BodyMotion(light * v[None], turns * w[None], light * x[None], turns * t[None]))
         elif body.name in spread:
             mine, (velocity, spin) = spread[body.name]
             found = []
@@ -103,10 +93,10 @@ def integrate(
                 wrench = jnp.stack([jnp.concatenate([forces[:, side], torques[:, side]], axis=1) for side in mine], 1)
                 wrench = wrench.reshape(2, -1, wrench.shape[-1])
                 found += [_summed(each, wrench) for each in (velocity, spin)]
-            parts.append(Gained(*found))
+            parts.append(BodyMotion(*found))
         else:
-            parts.append(Gained(*[jnp.zeros_like(links.position[rows])] * 4))
-    return Gained(*(jnp.concatenate(each) for each in zip(*parts, strict=True)))
+            parts.append(BodyMotion(*[jnp.zeros_like(seen.position[rows])] * 4))
+    return BodyMotion(*(jnp.concatenate(each) for each in zip(*parts, strict=True)))
 
 
 def _spread(
@@ -173,7 +163,8 @@ class System:
     def __init__(
         self,
         candidates: Candidates,
-        links: Links,
+        seen: Kinematics,
+        rates: Rates,
         chosen: Array,
         sides: Sides,
         spread: Spread,
@@ -185,11 +176,14 @@ class System:
         self.dt, self.h, self.settings, self.dtype = dt, dt / settings.substeps, settings, chosen.dtype
         self.coupled, self.couplings = _couplings(scene, sides, spread)
         self.same, self.together = _same_balls(scene, sides, balls)
-        self.position, self.half, self.velocity, self.spin, *rates = (sides.of(each) for each in links[:-1])
-        self.acceleration, self.turning, self.jerk, self.angular_jerk, self.uncounted, self.uncounted_turning = rates
-        self.radius, self.light, self.turns = (
-            sides.of(each) for each in (links.sizes[:, 1:2], *_looseness(links.sizes))
-        )
+        self.position, self.half, self.velocity, self.spin, self.radius, self.light, self.turns = (
+            sides.of(each)
+            for each in (
+                seen.position, seen.half, seen.velocity, seen.angular_velocity, seen.sizes[:, 1:2],
+                *_looseness(seen.sizes),
+            )
+        )  # fmt: skip
+        self.rates = Rates(*(sides.of(each) for each in rates))
         # Second links count against first ones, and balls against the ground.
         pairs, rest = range(self.pairs), range(self.pairs, self.pairs + self.balls)
         self.contact_of = np.array([*pairs, *pairs, *rest])
@@ -286,10 +280,12 @@ class System:
         gains = self.gains(arms)
         # Accelerations are mean ones where `late` is zero. What servos take back is no acceleration of the joints.
         late = (number + 0.5) * h - 0.5 * self.dt
-        faster = h * (self.acceleration + late * self.jerk) + (self.left - 1.0) * moves.fading
-        spinning = h * (self.turning + late * self.angular_jerk) + (self.left - 1.0) * moves.fading_turning
+        rates = self.rates
+        faster = h * (rates.acceleration + late * rates.jerk) + (self.left - 1.0) * moves.fading
+        spinning = h * (rates.angular_acceleration + late * rates.angular_jerk)
+        spinning += (self.left - 1.0) * moves.fading_turning
         now = self.relative(moves.velocity + cross(moves.spin, arms))
-        uncounted = self.relative(self.uncounted + cross(self.uncounted_turning, arms))
+        uncounted = self.relative(rates.uncounted + cross(rates.uncounted_angular, arms))
         problem = ContactProblem(
             velocity=now + self.relative(faster + cross(spinning, arms)),
             admittance=self.admittance(arms, gains),

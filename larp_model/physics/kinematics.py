@@ -1,6 +1,6 @@
-"""What follows from a state and is asked for more than once in a step: rotations, axes, how far joints are apart.
+"""All that follows from a state alone: rotations, axes, joint anchors, and how far joints are apart.
 
-World frame, batch first.
+World frame; arrays have the batch last, as in `linalg`. A step computes it once, and everything else takes it.
 """
 
 from __future__ import annotations
@@ -11,105 +11,125 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model import rotation
 from larp_model import state as packed
-from larp_model.contact import Segment
+from larp_model.linalg import cross, mv, rotation_matrices
 from larp_model.scene import Body, Scene, Vector
 
 
-class Kinematics(NamedTuple):
-    """Of the links of a scene, or of one body.
+class Anchors(NamedTuple):
+    """Joints as seen from the centres of their children and of their parents, (J, 3, B) [m] each."""
 
-    state: (B, L, 13). matrices: (B, L, 3, 3) from link to world. halves: (B, L, 3) [m] from the links' centres to one
-    end of their axes. displacement: (B, number of joints, 3) [m]. morphology: (B or 1, L, 3).
+    child: Array
+    parent: Array
+
+
+class Kinematics(NamedTuple):
+    """Links of a scene, or of one body, in states (L, 13, B), and their joints.
+
+    sizes: length [m], radius [m] and mass [kg], (L, 3, B). matrices: (L, 3, 3, B) from link to world. half: (L, 3, B)
+    [m] from the links' centres to one end of their axes. local_anchors: in the links' frames; anchors: in the world's
+    axes. displacement: (J, 3, B) [m], the joint by the child, less by the parent.
     """
 
     state: Array
+    sizes: Array
     matrices: Array
-    halves: Array
+    half: Array
+    local_anchors: Anchors
+    anchors: Anchors
     displacement: Array
-    morphology: Array
+
+    @property
+    def position(self) -> Array:
+        """Return the links' centres (L, 3, B) [m]."""
+        return self.state[:, packed.POSITION]
+
+    @property
+    def orientation(self) -> Array:
+        """Return unit quaternions (L, 4, B), w first."""
+        return self.state[:, packed.ORIENTATION]
+
+    @property
+    def velocity(self) -> Array:
+        """Return velocities (L, 3, B) [m/s] of the links' centres."""
+        return self.state[:, packed.VELOCITY]
+
+    @property
+    def angular_velocity(self) -> Array:
+        """Return angular velocities (L, 3, B) [rad/s]."""
+        return self.state[:, packed.ANGULAR_VELOCITY]
 
     def of(self, scene: Scene, body: str) -> Kinematics:
-        """Those of a body of the scene."""
+        """Return those of a body of the scene."""
         rows, joints = scene.rows(body), scene.joint_rows(body)
+        local, turned = (
+            Anchors(each.child[joints], each.parent[joints]) for each in (self.local_anchors, self.anchors)
+        )
         return Kinematics(
-            self.state[:, rows], self.matrices[:, rows], self.halves[:, rows], self.displacement[:, joints],
-            self.morphology[:, rows],
+            self.state[rows], self.sizes[rows], self.matrices[rows], self.half[rows], local, turned,
+            self.displacement[joints],
         )  # fmt: skip
 
-    def segments(self, rows: np.ndarray) -> Segment:
-        """Return the axes of links by their rows (P,)."""
-        centre, radius = packed.position(self.state)[:, rows], self.morphology[:, rows, 1]
-        return Segment(centre, self.halves[:, rows], jnp.broadcast_to(radius, centre.shape[:2]))
+
+def kinematics(scene: Scene, state: Array, sizes: Array) -> Kinematics:
+    """Return the kinematics of states (L, 13, B) of links of sizes (L, 3, B or 1)."""
+    sizes = jnp.broadcast_to(sizes, (*sizes.shape[:2], state.shape[-1]))
+    matrices = rotation_matrices(state[:, packed.ORIENTATION])
+    axes = jnp.array([link.axis for link in scene.links], state.dtype)[..., None]
+    half = 0.5 * sizes[:, :1] * mv(matrices, axes)
+    joints, position = list(scene.joints()), state[:, packed.POSITION]
+    children, parents = (np.array([joint[end] for joint in joints], int) for end in (0, 1))
+    local = Anchors(
+        local_anchors(scene, children, [joint.child_anchor for *_, joint in joints], sizes),
+        local_anchors(scene, parents, [joint.parent_anchor for *_, joint in joints], sizes),
+    )
+    turned = Anchors(mv(matrices[children], local.child), mv(matrices[parents], local.parent))
+    displacement = position[children] + turned.child - (position[parents] + turned.parent)
+    return Kinematics(state, sizes, matrices, half, local, turned, displacement)
 
 
-def kinematics(scene: Scene, state: Array, morphology: Array) -> Kinematics:
-    """Of states (B, L, 13) and a morphology (B or 1, L, 3)."""
-    matrices = rotation.matrix(packed.orientation(state))
-    axes = np.array([link.axis for link in scene.links], np.float32)
-    halves = apply(matrices, 0.5 * morphology[..., 0:1] * axes)
-    return Kinematics(state, matrices, halves, _displacement(scene, state, matrices, morphology), morphology)
+def local_anchors(scene: Scene, rows: np.ndarray, points: list[Vector], sizes: Array) -> Array:
+    """Return joint anchors (J, 3, B) [m] in the frames of the links in these rows, of sizes (L, 3, B).
 
-
-def apply(matrices: Array, vectors: Array) -> Array:
-    """Vectors (*, 3) turned by matrices (*, 3, 3)."""
-    return jnp.sum(matrices * vectors[..., None, :], axis=-1)
-
-
-def morphology_of(scene: Scene) -> Array:
-    """The morphology (L, 3) that the scene has by itself."""
-    return jnp.asarray(scene.morphology)
-
-
-def strength(body: Body, morphology: Array) -> Array:
-    """How many times as strong (*,) the motors of a morphology (*, n, 3) are as the body's own: see `Body.sized`."""
-    return jnp.sum(morphology[..., 0], axis=-1) * jnp.sum(morphology[..., 2], axis=-1) / body.weighed
-
-
-def anchors(points: list[Vector], axes: list[Vector], morphology: Array) -> Array:
-    """Joint anchors (*, J, 3) [m] in the frames of links of a morphology (*, J, 3)."""
-    axis, point = (np.asarray(each, np.float32).reshape(-1, 3) for each in (axes, points))
+    points: in shares of half the length along the link's axis, and of the radius across it, see `Joint`.
+    """
+    axis = np.array([scene.links[row].axis for row in rows], np.float32).reshape(-1, 3)
+    point = np.array(points, np.float32).reshape(-1, 3)
     along = np.sum(axis * point, axis=-1, keepdims=True) * axis
-    return 0.5 * morphology[..., 0:1] * along + morphology[..., 1:2] * (point - along)
+    length, radius = sizes[rows, 0:1], sizes[rows, 1:2]
+    return 0.5 * length * along[..., None] + radius * (point - along)[..., None]
 
 
 def displacement(scene: Scene, state: Array, morphology: Array) -> Array:
-    """Joint displacement (*, number of joints, 3) [m], world frame: the joint by the child, less by the parent.
+    """Return joint displacements (*, J, 3) [m] of states (*, L, 13) and morphologies (*, L, 3): see `Kinematics`."""
+    sizes = jnp.broadcast_to(jnp.asarray(morphology), (*state.shape[:-1], 3))
+    flat = (each.reshape(-1, *each.shape[-2:]) for each in (state, sizes))
+    seen = kinematics(scene, *(jnp.moveaxis(each, 0, -1) for each in flat))
+    return jnp.moveaxis(seen.displacement, -1, 0).reshape(*state.shape[:-2], -1, 3)
 
-    state (*, L, 13), morphology (*, L, 3).
+
+def morphology_of(scene: Scene) -> Array:
+    """Return the morphology (L, 3) that the scene has by itself."""
+    return jnp.asarray(scene.morphology)
+
+
+def motor_scale(body: Body, sizes: Array) -> Array:
+    """Return (B,) how many times as strong motors are in links of sizes (n, 3, B) as the body's own: `Body.sized`."""
+    return jnp.sum(sizes[:, 0], axis=0) * jnp.sum(sizes[:, 2], axis=0) / body.weighed
+
+
+def ends_on_ground(seen: Kinematics, velocity: Array, angular_velocity: Array, dt: float) -> tuple[Array, Array]:
+    """Return how both ends of every link are to the ground: velocities (2 n, 3, B) where near it, and (6 n, B).
+
+    velocity, angular_velocity: of the links (n, 3, B). The second are clearance [m], nearness (1 on the ground, falling
+    off over 3 cm), and depth [m] after `dt`.
     """
-    return _displacement(scene, state, rotation.matrix(packed.orientation(state)), morphology)
-
-
-def _displacement(scene: Scene, state: Array, matrices: Array, morphology: Array) -> Array:
-    joints, links = list(scene.joints()), scene.links
-    if not joints:
-        return jnp.zeros((*state.shape[:-2], 0, 3), state.dtype)
-
-    def places(rows: list[int], points: list[Vector]) -> Array:
-        chosen = np.array(rows)
-        offset = anchors(points, [links[row].axis for row in rows], morphology[..., chosen, :])
-        return packed.position(state)[..., chosen, :] + apply(matrices[..., chosen, :, :], offset)
-
-    by_child = places([child for child, _, _ in joints], [joint.child_anchor for _, _, joint in joints])
-    by_parent = places([parent for _, parent, _ in joints], [joint.parent_anchor for _, _, joint in joints])
-    return by_child - by_parent
-
-
-def ends_on_ground(seen: Kinematics, velocity: Array, spin: Array, dt: float) -> tuple[Array, Array]:
-    """How the two ends of every link are to the ground: velocities (B, 2 n, 3) where near it, and scalars (B, 6 n).
-
-    velocity, spin: of the links (B, n, 3). The scalars are clearance [m], nearness (1 on the ground, falling off over
-    3 cm), and depth [m] after `dt`.
-    """
-    arms = jnp.concatenate([seen.halves, -seen.halves], axis=-2)
-    place, velocity, spin, radius = (
-        jnp.concatenate([part, part], axis=-2)
-        for part in (packed.position(seen.state), velocity, spin, seen.morphology[..., 1:2])
+    arms = jnp.concatenate([seen.half, -seen.half])
+    position, velocity, angular_velocity, radius = (
+        jnp.concatenate([part, part]) for part in (seen.position, velocity, angular_velocity, seen.sizes[:, 1])
     )
-    velocity = velocity + jnp.cross(spin, arms)
-    clearance = (place + arms)[..., 2] - radius[..., 0]
+    velocity = velocity + cross(angular_velocity, arms)
+    clearance = (position + arms)[:, 2] - radius
     near = jnp.exp(-jnp.maximum(clearance, 0.0) / 0.03)
-    deep = jnp.minimum(clearance + dt * velocity[..., 2], 0.0)
-    return near[..., None] * velocity, jnp.concatenate([jnp.minimum(clearance, 0.1), near, deep], axis=-1)
+    deep = jnp.minimum(clearance + dt * velocity[:, 2], 0.0)
+    return near[:, None] * velocity, jnp.concatenate([jnp.minimum(clearance, 0.1), near, deep])

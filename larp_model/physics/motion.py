@@ -17,12 +17,11 @@ import numpy as np
 from jax import Array
 
 from larp_model import rotation
-from larp_model import state as packed
-from larp_model.kinematics import anchors, strength
 from larp_model.linalg import barrier, cross, dot, mm, mv, rotated, rotation_matrices
-from larp_model.physics.articulated import Anchors, Inertia, Momenta, tree
+from larp_model.physics.articulated import Inertia, Momenta, tree
 from larp_model.physics.ground import Ends, GroundProblem, motion_on_ground
-from larp_model.scene import Body, Vector
+from larp_model.physics.kinematics import Anchors, Kinematics, motor_scale
+from larp_model.scene import Body
 
 GAMMA = 1.0 - math.sqrt(0.5)
 
@@ -42,7 +41,7 @@ class Constants:
 
 
 class BodyMotion(NamedTuple):
-    """Motion of a body within a step: (B, n, 3) each, world frame.
+    """Motion of a body within a step: (n, 3, B) each, world frame.
 
     velocity [m/s] and spin [rad/s] at its end; moved [m] and turned [rad] during it.
     """
@@ -56,11 +55,11 @@ class BodyMotion(NamedTuple):
 class Articulation(NamedTuple):
     """Inertia of an articulated body's links within a step, the ground's contacts included, and where its joints are.
 
-    jerk, angular_jerk: of the links, (n, 3, B) [m/s^3, rad/s^3]. Batch last.
+    jerk, angular_jerk: of the links, (n, 3, B) [m/s^3, rad/s^3].
     """
 
     inertia: Inertia
-    tied: Anchors
+    anchors: Anchors
     jerk: Array
     angular_jerk: Array
 
@@ -69,36 +68,19 @@ Begun = tuple[Array, Array, Array, Array]
 """Start of a stage: heights (n, 1, B) and rotation vectors (n, 3, B) gained, velocities and spins (n, 3, B)."""
 
 
-def free_motion(
-    body: Body, state: Array, control: Array, torque: Array, morphology: Array, gravity: float, dt: float,
-    constants: Constants = Constants(),
-) -> BodyMotion:  # fmt: skip
-    """Return how a body in states (B, n, 13) moves on within `dt` [s] if nothing but the ground touches it.
-
-    control (B, j, 3) joint targets [rad], torque (B, n, 3) [N m] from outside, morphology (B or 1, n, 3).
-    """
-    before, targets, outside, sizes = (jnp.moveaxis(each, 0, -1) for each in (state, control, torque, morphology))
-    motion, _ = articulated_motion(body, before, targets, outside, sizes, gravity, dt, constants)
-    return BodyMotion(*(jnp.moveaxis(each, -1, 0) for each in motion))
-
-
 def articulated_motion(
-    body: Body, state: Array, targets: Array, outside: Array, sizes: Array, gravity: float, dt: float,
+    body: Body, seen: Kinematics, targets: Array, outside: Array, gravity: float, dt: float,
     constants: Constants = Constants(),
 ) -> tuple[BodyMotion, Articulation]:  # fmt: skip
-    """Return `free_motion` with the batch last, and with what the body moves in the first of its two stages.
+    """Return how a body moves on within `dt` [s] if nothing but the ground touches it, and its inertia on the way.
 
-    state (n, 13, B), targets (j, 3, B) [rad], outside (n, 3, B) [N m], sizes (n, 3, B or 1).
+    targets (j, 3, B) of its joints [rad], outside (n, 3, B) [N m] torque. The inertia is that of the first stage.
     """
-    h = GAMMA * dt
-    position, orientation, velocity, spin = (
-        state[:, columns] for columns in (packed.POSITION, packed.ORIENTATION, packed.VELOCITY, packed.ANGULAR_VELOCITY)
-    )
-    local, stronger = local_anchors(body, sizes), strength(body, jnp.moveaxis(sizes, -1, 0))
-    child, parent = turned_anchors(body, local, rotation_matrices(orientation))
-    parents = np.array([joint.parent for joint in body.joints], int)
-    gap = position[parents] + parent - (position[1:] + child)
-    down = jnp.array([0.0, 0.0, -gravity], state.dtype)[:, None]
+    h, sizes, local = GAMMA * dt, seen.sizes, seen.local_anchors
+    orientation, velocity, spin = seen.orientation, seen.velocity, seen.angular_velocity
+    stronger = motor_scale(body, sizes)
+    down = jnp.array([0.0, 0.0, -gravity], velocity.dtype)[:, None]
+    closing = -constants.closing / dt * seen.displacement
 
     def stage(
         raised: Array, turned: Array, velocity: Array, spin: Array
@@ -109,19 +91,17 @@ def articulated_motion(
         inertia = inertias(body, matrices, sizes)
         momentum, mass = mv(inertia.turning, spin), sizes[:, 2:3]
         push = Momenta(momentum + h * (outside - cross(spin, momentum)), mass * (velocity + h * down))
-        tied = turned_anchors(body, local, matrices)
+        anchors = turned_anchors(body, local, matrices)
         before = rotation_matrices(start)
         pull, hold = servos(body, start, before, targets, spin, h, stronger)
-        height = position[:, 2:] + raised
-        tied, pull, hold = barrier((tied, pull, hold))
-        ends = Ends.of(body, before, height, velocity, spin, sizes, h, velocity_products(body, tied, spin))
+        height = seen.position[:, 2:] + raised
+        anchors, pull, hold = barrier((anchors, pull, hold))
+        ends = Ends.of(body, before, height, velocity, spin, sizes, h, velocity_products(body, anchors, spin))
         whole = jnp.sum(jnp.broadcast_to(mass, velocity[:, :1].shape), axis=0, keepdims=True)
-        problem = GroundProblem(
-            inertia, push, tied, constants.closing / dt * gap, pull, hold, ends, constants.standing * whole, h
-        )
+        problem = GroundProblem(inertia, push, anchors, closing, pull, hold, ends, constants.standing * whole, h)
         motion = motion_on_ground(body, constants.iterations, problem, velocity + h * down, spin)
         on_ground, _ = problem.linear(motion)
-        return (motion.velocity, motion.spin), (jax.tree.map(jnp.add, inertia, on_ground), tied)
+        return (motion.velocity, motion.spin), (jax.tree.map(jnp.add, inertia, on_ground), anchors)
 
     ratio = (1.0 - GAMMA) / GAMMA
 
@@ -135,31 +115,31 @@ def articulated_motion(
     still = jnp.zeros_like(spin)
     _, ((velocities, spins), stages) = jax.lax.scan(advance, (still[:, 2:], still, velocity, spin), length=2)
     moved, turned = (dt * ((1.0 - GAMMA) * one + GAMMA * two) for one, two in (velocities, spins))
-    inertia, tied = jax.tree.map(lambda each: each[0], stages)
+    inertia, anchors = jax.tree.map(lambda each: each[0], stages)
     # Accelerations k_1 and k_2 at GAMMA and 1 of the step are (1 - GAMMA) k_1 + GAMMA k_2 on average, as if straight.
     jerk, angular_jerk = (
         ((after[1] - before) / dt - (after[0] - before) / h) / (GAMMA * (1.0 - GAMMA) * dt)
         for after, before in ((velocities, velocity), (spins, spin))
     )
-    return BodyMotion(velocities[1], spins[1], moved, turned), Articulation(inertia, tied, jerk, angular_jerk)
+    return BodyMotion(velocities[1], spins[1], moved, turned), Articulation(inertia, anchors, jerk, angular_jerk)
 
 
-def velocity_products(body: Body, tied: Anchors, spin: Array) -> tuple[Array, Array]:
+def velocity_products(body: Body, anchors: Anchors, spin: Array) -> tuple[Array, Array]:
     """Return accelerations (n, 3, B) [m/s^2] and [rad/s^2] of links whose root and joints do not accelerate.
 
-    MuJoCo leaves them out of a contact's acceleration. tied: from links' centres to their joints.
+    MuJoCo leaves them out of a contact's acceleration. anchors: from links' centres to their joints.
     """
     parents = np.array([joint.parent for joint in body.joints], int)
     # How the two points of a joint accelerate apart as their links turn, and the joint's axes with the child.
-    closing = cross(spin[parents], cross(spin[parents], tied.parent))
-    closing -= cross(spin[1:], cross(spin[1:], tied.child))
+    closing = cross(spin[parents], cross(spin[parents], anchors.parent))
+    closing -= cross(spin[1:], cross(spin[1:], anchors.child))
     carried = cross(spin[1:], spin[1:] - spin[parents])
     velocity = turning = jnp.zeros_like(spin[:1])
     rows = np.array([0])
     for level, above in tree(body):
         known, joint = np.array([int(np.flatnonzero(rows == row)[0]) for row in above]), level - 1
         outer = turning[known] + carried[joint]
-        moving = velocity[known] + cross(turning[known], tied.parent[joint]) - cross(outer, tied.child[joint])
+        moving = velocity[known] + cross(turning[known], anchors.parent[joint]) - cross(outer, anchors.child[joint])
         velocity, turning = jnp.concatenate([velocity, moving + closing[joint]]), jnp.concatenate([turning, outer])
         rows = np.concatenate([rows, level])
     order = np.argsort(rows)
@@ -172,7 +152,7 @@ def servos(
     """Return pull (n - 1, 3, B) and hold (n - 1, 3, 3, B) of all joints within `h` [s]; see `articulated`.
 
     orientation (n, 4, B) and its matrices (n, 3, 3, B), targets (j, 3, B) [rad], spin (n, 3, B); stronger (B or 1,) is
-    `kinematics.strength`. A servo that is at its limit pulls on, and yields.
+    `kinematics.motor_scale`. A servo that is at its limit pulls on, and yields.
     """
     links, batch = len(body.links), spin.shape[-1]
     motors, passive = np.zeros((4, links - 1, 1, 1), np.float32), np.zeros((links - 1, 1, 1), np.float32)
@@ -206,21 +186,8 @@ def angles(parent: Array, child: Array) -> Array:
     return jnp.moveaxis(rotation.to_rotation_vector(jnp.moveaxis(relative, 1, -1)), -1, 1)
 
 
-def local_anchors(body: Body, sizes: Array) -> Anchors:
-    """Return where joints are in the frames of their children and their parents, (n - 1, 3, B or 1) [m] each."""
-
-    def place(rows: list[int], points: list[Vector]) -> Array:
-        chosen = jnp.moveaxis(sizes[np.array(rows, int)], -1, 0)
-        return jnp.moveaxis(anchors(points, [body.links[row].axis for row in rows], chosen), 0, -1)
-
-    return Anchors(
-        place(list(range(1, len(body.links))), [joint.child_anchor for joint in body.joints]),
-        place([joint.parent for joint in body.joints], [joint.parent_anchor for joint in body.joints]),
-    )
-
-
 def turned_anchors(body: Body, local: Anchors, matrices: Array) -> Anchors:
-    """Return the same from the links' centres, (n - 1, 3, B) [m], of links so turned (n, 3, 3, B)."""
+    """Return joint anchors in the world's axes, of links turned by matrices (n, 3, 3, B)."""
     parents = np.array([joint.parent for joint in body.joints], int)
     return Anchors(mv(matrices[1:], local.child), mv(matrices[parents], local.parent))
 

@@ -19,10 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model.kinematics import strength
 from larp_model.linalg import barrier, cross_columns, mm
 from larp_model.physics.articulated import (
-    Anchors,
     Inertia,
     Joined,
     Momenta,
@@ -34,6 +32,7 @@ from larp_model.physics.articulated import (
     tree,
     with_children,
 )
+from larp_model.physics.kinematics import Anchors, motor_scale
 from larp_model.physics.motion import Articulation
 from larp_model.scene import Body
 
@@ -55,16 +54,16 @@ def responses(
     sizes (n, 3, B). See the module.
     """
     if not body.joints:
-        kept = _gained(body, articulation.tied, [], inverse_inertia(articulation.inertia), pushes)
+        kept = _gained(body, articulation.anchors, [], inverse_inertia(articulation.inertia), pushes)
         return kept, Gains(*(jnp.zeros_like(each) for each in kept))
     # W(0) and W(T) side by side.
     doubled = _twice(articulation)
     resisting = jnp.concatenate([_resistance(body, sizes, after) for after in (0.0, fade)], axis=-1)
     unit = jnp.eye(3, dtype=sizes.dtype)[..., None]
     still = jnp.zeros_like(doubled.inertia.moving[:, 0])
-    levels = levels_of(body, doubled.tied, still[1:], still[1:], resisting * unit)
+    levels = levels_of(body, doubled.anchors, still[1:], still[1:], resisting * unit)
     whole, _, joints = inwards(doubled.inertia, Momenta(still, still), levels)
-    gained = _gained(body, doubled.tied, joints, inverse_inertia(whole), _twice(pushes))
+    gained = _gained(body, doubled.anchors, joints, inverse_inertia(whole), _twice(pushes))
     now, later = (Gains(*each) for each in zip(*(jnp.split(each, 2, axis=-1) for each in gained), strict=True))
     # W(0) = kept + fading, W(T) = kept + fading / 2
     kept = Gains(*(2.0 * b - a for a, b in zip(now, later, strict=True)))
@@ -73,7 +72,7 @@ def responses(
 
 def _resistance(body: Body, sizes: Array, after: float) -> Array:
     """Return (n - 1, 1, 1, B) [kg m^2] the moment that joints have taken up after a time [s], per spin."""
-    stronger = strength(body, jnp.moveaxis(sizes, -1, 0))
+    stronger = motor_scale(body, sizes)
     rows = []
     for joint in body.joints:
         if joint.motor is None:
@@ -84,14 +83,14 @@ def _resistance(body: Body, sizes: Array, after: float) -> Array:
     return jnp.stack(rows)[:, None, None]
 
 
-def _gained(body: Body, tied: Anchors, joints: list[Joined], root: Inertia, pushes: Momenta) -> Gains:
+def _gained(body: Body, anchors: Anchors, joints: list[Joined], root: Inertia, pushes: Momenta) -> Gains:
     """Return what links gain by pushes, the inertias of the tree being known: see `articulated.inwards`."""
     levels, halves = tree(body), []
     every = jnp.concatenate([pushes.turning, pushes.moving], axis=1)
     handed, below = every[:0], np.array([], int)
     for (rows, above), joint in zip(reversed(levels), reversed(joints), strict=True):
         own = barrier(with_children(every[rows], rows, handed, below))
-        child, arm = tied.child[rows - 1], tied.child[rows - 1] - tied.parent[rows - 1]
+        child, arm = anchors.child[rows - 1], anchors.child[rows - 1] - anchors.parent[rows - 1]
         half = barrier(mm(joint.solved, own[:, :3] - cross_columns(child, own[:, 3:])))
         halves.append(half)
         handed, below = barrier(carried_back(arm, own - mm(jnp.swapaxes(joint.half, 1, 2), half))), above
@@ -99,7 +98,7 @@ def _gained(body: Body, tied: Anchors, joints: list[Joined], root: Inertia, push
     motions, order = [mm(packed_inertia(root), at_root)], [np.array([0])]
     for (rows, above), joint, half in zip(levels, joints, reversed(halves), strict=True):
         parent = motions[-1][np.searchsorted(order[-1], above)]
-        child, arm = tied.child[rows - 1], tied.child[rows - 1] - tied.parent[rows - 1]
+        child, arm = anchors.child[rows - 1], anchors.child[rows - 1] - anchors.parent[rows - 1]
         carried = parent[:, 3:] + cross_columns(arm, parent[:, :3])
         given = jnp.concatenate([parent[:, :3], carried], axis=1)
         relative = barrier(mm(jnp.swapaxes(joint.solved, 1, 2), half) - mm(joint.by_parent, given))

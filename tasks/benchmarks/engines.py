@@ -26,9 +26,9 @@ from jax import Array
 
 from larp_model import state as packed
 from larp_model.bodies import human_and_ball
+from larp_model.engines.mujoco import SUBSTEPS, Truth, compile_model
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
-from larp_model.truth.mujoco import SUBSTEPS, Truth, compile_model
 from mpc.dynamics import BatchedTruth
 from tasks.benchmarks import report
 from tasks.motions.references import embedded
@@ -219,7 +219,7 @@ def _last(position: Array, velocity: Array) -> Array:
 
 def bullet(scene: Scene, substeps: int, batch: int) -> BatchedTruth:
     """Bullet, behind the same door as the truth."""
-    from larp_model.truth.bullet import BulletTruth
+    from larp_model.engines.bullet import BulletTruth
 
     return BulletTruth(scene, batch, substeps)
 

@@ -20,9 +20,9 @@ from rich.table import Table
 from scipy.stats import spearmanr
 
 from larp_model import evaluation
+from larp_model.engines.episodes import Episodes
 from larp_model.errors import InputError
 from larp_model.simulator import Simulator
-from larp_model.truth.episodes import Episodes
 from mpc import Dynamics, evaluate
 from mpc.search import coloured_noise
 from tasks.benchmarks import report

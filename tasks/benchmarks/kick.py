@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from larp_model.anatomy import Detail
+from larp_model.engines.mujoco import FINE_SUBSTEPS
 from larp_model.errors import InputError
-from larp_model.truth.mujoco import FINE_SUBSTEPS
 from tasks.benchmarks import report
 from tasks.command import prepare_jax, run
 from tasks.data import random_roll, random_task

@@ -15,13 +15,13 @@ from rich.table import Table
 
 from larp_model import evaluation
 from larp_model.designs import DesignName
+from larp_model.engines import episodes as truth_episodes
+from larp_model.engines.bullet import BulletTruth
+from larp_model.engines.episodes import Episodes
+from larp_model.engines.mujoco import FINE_SUBSTEPS, Truth
 from larp_model.errors import InputError
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
-from larp_model.truth import episodes as truth_episodes
-from larp_model.truth.bullet import BulletTruth
-from larp_model.truth.episodes import Episodes
-from larp_model.truth.mujoco import FINE_SUBSTEPS, Truth
 from tasks.benchmarks import report
 from tasks.command import prepare_jax, run
 from tasks.scenarios import Scenario, around, scenario, trained_at

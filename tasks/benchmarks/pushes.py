@@ -16,14 +16,15 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from larp_model import contact, kinematics
+from larp_model import contact
 from larp_model import state as packed
 from larp_model.bodies import ball, capsule, chain, human, kicking_links
+from larp_model.engines.mujoco import Truth
+from larp_model.engines.mujoco import finite as truth_finite
 from larp_model.errors import InputError
+from larp_model.physics import kinematics
 from larp_model.scene import Pair, Scene
 from larp_model.simulator import Simulator
-from larp_model.truth.mujoco import Truth
-from larp_model.truth.mujoco import finite as truth_finite
 from mpc import CostTerm, evaluate
 from tasks.benchmarks.report import Row
 from tasks.kick import Kick

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from larp_model import state as packed
+from larp_model.engines.mujoco import Truth
 from larp_model.scene import Scene
-from larp_model.truth.mujoco import Truth
 from tasks.benchmarks import report
 from tasks.benchmarks.engines import STEPPED, TRACED
 from tasks.gap import LAUNCH_STEPS, contact_step

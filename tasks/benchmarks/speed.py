@@ -23,8 +23,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from rich.table import Table
 
+from larp_model.engines.mujoco import SUBSTEPS as CONVERGED
 from larp_model.errors import InputError
-from larp_model.truth.mujoco import SUBSTEPS as CONVERGED
 from tasks.benchmarks import replays, report
 from tasks.benchmarks.engines import NAMES, PIPELINES, Question, case, titled
 from tasks.command import prepare_jax, run

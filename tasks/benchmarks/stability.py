@@ -17,9 +17,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
+from larp_model.engines.mujoco import Truth
 from larp_model.errors import InputError
 from larp_model.simulator import Simulator
-from larp_model.truth.mujoco import Truth
 from mpc import CEM, MPPI, CostTerm, GaussNewton, Gradient, Planner
 from mpc.loop import Phase, Window, execute
 from tasks.benchmarks import pushes, report, slopes

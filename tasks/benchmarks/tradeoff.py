@@ -13,8 +13,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
+from larp_model.engines.mujoco import SUBSTEPS
 from larp_model.errors import InputError
-from larp_model.truth.mujoco import SUBSTEPS
 from mpc import CEM, MPPI, GaussNewton, Gradient, Optimizer, Unless
 from tasks.benchmarks import report
 from tasks.command import prepare_jax, run

@@ -25,9 +25,9 @@ from jax import Array
 from scipy.spatial.transform import Rotation, Slerp
 
 from larp_model import state as packed
+from larp_model.engines.mujoco import Truth, closed
 from larp_model.rotation import matrix
 from larp_model.scene import Body, Scene, anchor
-from larp_model.truth.mujoco import Truth, closed
 from mpc import CostTerm, Dynamics, GaussNewton, Optimizer, Planner, Verified, quadratic
 from mpc.loop import Begun, Execution, Phase, Window, execute
 from tasks.data import stray

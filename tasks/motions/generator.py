@@ -7,10 +7,10 @@ from scipy.spatial.transform import Rotation
 
 from larp_model import bodies
 from larp_model import state as packed
+from larp_model.engines.episodes import Episodes, record
+from larp_model.engines.mujoco import Truth, closed
 from larp_model.rotation import turned_about_z
 from larp_model.scene import Body, Scene
-from larp_model.truth.episodes import Episodes, record
-from larp_model.truth.mujoco import Truth, closed
 from tasks.data import STEPS, out_of_legs, overlaps, pushes, random_places, smooth_noise, stray
 from tasks.motions import styles
 from tasks.motions.details import in_detail

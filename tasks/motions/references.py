@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from larp_model import bodies
 from larp_model import state as packed
 from larp_model.bodies import standing_height
+from larp_model.engines.mujoco import Truth, closed, finite
 from larp_model.errors import InputError
 from larp_model.rotation import turned_about_z
 from larp_model.scene import Body, Link, Scene
-from larp_model.truth.mujoco import Truth, closed, finite
 from tasks.motions import angles, bvh, key_poses, skeleton
 from tasks.motions.details import in_detail
 from tasks.motions.key_poses import KeyPoses

@@ -13,8 +13,8 @@ import numpy as np
 from jax import Array
 
 from larp_model import state as packed
+from larp_model.engines.mujoco import Truth
 from larp_model.scene import Scene
-from larp_model.truth.mujoco import Truth
 from mpc import CEM, CostTerm, MujocoDynamics, Planner, quadratic
 from mpc.loop import Phase, Window, execute
 
