@@ -15,8 +15,8 @@ import numpy as np
 from jax import Array
 
 from larp_model import state as packed
+from larp_model.detection import contact_points, first_contacts
 from larp_model.errors import InputError
-from larp_model.meeting import first_contacts, meetings
 from larp_model.prediction import predict
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
@@ -162,11 +162,11 @@ def _touched(scene: Scene, states: np.ndarray, morphology: np.ndarray) -> tuple[
 def _pushes(scene: Scene, before: Array, after: Array, morphology: Array) -> Array:
     """Return a mask (B, P) of the links that touch the ball, and push it, between states (B, L, 13)."""
     alone = replace(scene, pairs=scene.between.pairs[:1])
-    ((pair, meeting),) = meetings(alone, before, morphology, after)
+    ((pair, points),) = contact_points(alone, before, morphology, after)
     ball = scene.index(pair.second, pair.second_links[0])
     free = jnp.array([0.0, 0.0, -scene.gravity * scene.dt], before.dtype)
     change = packed.velocity(after)[:, ball] - packed.velocity(before)[:, ball] - free
-    return (meeting.lowest < TOUCHING) & (jnp.linalg.norm(change, axis=-1) > PUSH)[:, None]
+    return (points.lowest < TOUCHING) & (jnp.linalg.norm(change, axis=-1) > PUSH)[:, None]
 
 
 def _without_side(link: str) -> str:

@@ -21,11 +21,11 @@ from jax import Array
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from larp_model import losses, rotation
+from larp_model.detection import contact_points, first_contacts
 from larp_model.errors import InputError
 from larp_model.learned.model import Model, initial_weights
 from larp_model.learned.residual import ResidualModel
 from larp_model.losses import LossWeights
-from larp_model.meeting import first_contacts, meetings
 from larp_model.networks import Weights
 from larp_model.scene import Scene
 from larp_model.simulator import rollout
@@ -218,8 +218,8 @@ def step_loss(model: ResidualModel, weights: Weights, states: Array, drawn: Any)
     """
     before, after = states[:, 0], states[:, 1]
     apart = jnp.ones(len(states))
-    for _, meeting in meetings(model.scene, before, drawn.morphology, after):
-        apart *= 1.0 - jnp.max(meeting.near, axis=1)
+    for _, points in contact_points(model.scene, before, drawn.morphology, after):
+        apart *= 1.0 - jnp.max(points.near, axis=1)
     apart /= jnp.maximum(jnp.sum(apart), 1.0)
     loss = jnp.zeros(())
     given = drawn.controls[:, 0], drawn.torques[:, 0], drawn.morphology

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
 from larp_model.bodies import segment_of
+from larp_model.detection import contact_points
 from larp_model.engines.episodes import Episodes, record
 from larp_model.engines.mujoco import Truth, closed
-from larp_model.meeting import meetings
 from larp_model.physics.kinematics import morphology_of
 from larp_model.rotation import turned_about_z
 from larp_model.scene import Link, Scene
@@ -169,8 +169,8 @@ def overlaps(scene: Scene, states: np.ndarray, morphology: np.ndarray | None = N
 @partial(jax.jit, static_argnums=0)  # which compiles in a tenth of the time that its operations take one by one
 def _overlaps(scene: Scene, states: Array, sizes: Array) -> Array:
     lowest = jnp.full(len(states), jnp.inf)
-    for _, met in meetings(scene, states, sizes):
-        lowest = jnp.minimum(lowest, met.gap.min(axis=1))
+    for _, points in contact_points(scene, states, sizes):
+        lowest = jnp.minimum(lowest, points.gap.min(axis=1))
     return lowest < 0.0
 
 

@@ -12,7 +12,7 @@ from jax import Array
 from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
-from larp_model.meeting import meetings
+from larp_model.detection import contact_points
 from larp_model.physics.kinematics import morphology_of
 from larp_model.scene import Scene
 
@@ -129,8 +129,8 @@ def _nearest(scene: Scene, state: np.ndarray) -> tuple[str, np.ndarray]:
 
 @partial(jax.jit, static_argnums=0)
 def _approached(scene: Scene, state: Array) -> tuple[Array, Array]:
-    [(_, met)] = meetings(scene, state[None], morphology_of(scene)[None])
-    return met.gap[0] - met.near[0], met.normal[0]
+    [(_, points)] = contact_points(scene, state[None], morphology_of(scene)[None])
+    return points.gap[0] - points.near[0], points.normal[0]
 
 
 def _list(values: np.ndarray) -> list[float]:

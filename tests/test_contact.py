@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,14 +17,37 @@ from jax.test_util import check_grads
 from mujoco.mjx._src.collision_primitive import capsule_capsule
 from scipy.spatial.transform import Rotation
 
-from larp_model import contact
 from larp_model import state as packed
-from larp_model.contact import Closest, Segment
-from larp_model.meeting import Meeting, meetings
+from larp_model.detection import ContactPoints, contact_points
+from larp_model.physics import collision
+from larp_model.physics.collision import Capsules, ClosestPoints
 from larp_model.physics.kinematics import morphology_of
 from larp_model.scene import Scene, Vector
 
-closest = jax.jit(contact.closest)
+
+class Segment(NamedTuple):
+    """Capsules with the batch first: centre (*, 3), half (*, 3), radius (*,) [m]."""
+
+    centre: Array
+    half: Array
+    radius: Array
+
+    @property
+    def capsules(self) -> Capsules:
+        """Return the same as one pair's, with the batch last."""
+        return Capsules(*(each.reshape(-1, size).T[None] for each, size in zip(self, (3, 3, 1), strict=True)))
+
+
+def closest_points(first: Segment, second: Segment) -> ClosestPoints:
+    """Return `collision.closest` with the batch first: normal (*, 3), distance (*,), point (*, 3), along (*, 2)."""
+    found, batch = collision.closest(first.capsules, second.capsules), first.radius.shape
+    normal, distance, point, along = (each[0].T for each in found)
+    return ClosestPoints(
+        normal.reshape(*batch, 3), distance.reshape(batch), point.reshape(*batch, 3), along.reshape(*batch, 2)
+    )
+
+
+closest = jax.jit(closest_points)
 
 
 @pytest.fixture(autouse=True)
@@ -47,7 +71,7 @@ def segments(seed: int, count: int = 300) -> tuple[Segment, Segment]:
     )
 
 
-def ends(first: Segment, second: Segment, found: Closest) -> tuple[Array, Array]:
+def ends(first: Segment, second: Segment, found: ClosestPoints) -> tuple[Array, Array]:
     """The closest points of both axes."""
     one = first.centre + found.along[..., :1] * first.half
     return one, second.centre + found.along[..., 1:] * second.half
@@ -151,12 +175,12 @@ VECTOR = st.tuples(COORDINATE, COORDINATE, COORDINATE)
 
 
 @jax.jit
-def closest_and_gradients(numbers: Array) -> tuple[Closest, Array, Array]:
+def closest_and_gradients(numbers: Array) -> tuple[ClosestPoints, Array, Array]:
     """Closest points of two capsules of radius 0.1 with these (4, 3) centres and halves, and their derivatives."""
 
-    def found(numbers: Array) -> Closest:
+    def found(numbers: Array) -> ClosestPoints:
         radius = jnp.array(0.1, numbers.dtype)
-        return contact.closest(Segment(numbers[0], numbers[1], radius), Segment(numbers[2], numbers[3], radius))
+        return closest_points(Segment(numbers[0], numbers[1], radius), Segment(numbers[2], numbers[3], radius))
 
     def flat(numbers: Array) -> Array:
         return jnp.concatenate([part.reshape(-1) for part in found(numbers)])
@@ -198,7 +222,7 @@ def test_gradients_are_finite_where_capsules_are_degenerate(case: str, precise: 
 
 def test_gradient_of_the_distance_is_the_normal() -> None:
     first, second = segments(5)
-    slope = jax.jit(jax.grad(lambda centre: contact.closest(first, second._replace(centre=centre)).distance.sum()))
+    slope = jax.jit(jax.grad(lambda centre: closest_points(first, second._replace(centre=centre)).distance.sum()))
     defined = apart(first, second)
     np.testing.assert_allclose(slope(second.centre)[defined], closest(first, second).normal[defined], atol=1e-6)
 
@@ -206,9 +230,9 @@ def test_gradient_of_the_distance_is_the_normal() -> None:
 def test_forward_reverse_and_finite_differences_of_closest_agree() -> None:
     pairs = np.random.default_rng(6).uniform(-0.5, 0.5, (4, 4, 3))
 
-    def found(numbers: Array) -> Closest:
+    def found(numbers: Array) -> ClosestPoints:
         radius = jnp.full(len(pairs), 0.1)
-        return contact.closest(Segment(numbers[0], numbers[1], radius), Segment(numbers[2], numbers[3], radius))
+        return closest_points(Segment(numbers[0], numbers[1], radius), Segment(numbers[2], numbers[3], radius))
 
     check_grads(jax.jit(found), (jnp.asarray(pairs.swapaxes(0, 1)),), 1, ("fwd", "rev"), 1e-5, 1e-5, eps=1e-6)
 
@@ -216,14 +240,15 @@ def test_forward_reverse_and_finite_differences_of_closest_agree() -> None:
 def test_moved_segments_keep_their_length() -> None:
     first, _ = segments(7)
     velocity, spin = np.random.default_rng(7).standard_normal((2, 300, 3))
-    moved = contact.moved(first, jnp.asarray(velocity), jnp.asarray(20.0 * spin), jnp.full(300, 0.01))
-    np.testing.assert_allclose(np.linalg.norm(moved.half, axis=-1), np.linalg.norm(first.half, axis=-1), atol=1e-12)
-    np.testing.assert_allclose(moved.centre, first.centre + 0.01 * velocity)
+    linear, angular = (jnp.asarray(each).T[None] for each in (velocity, 20.0 * spin))
+    moved = collision.advanced(first.capsules, linear, angular, jnp.full((1, 1, 300), 0.01))
+    np.testing.assert_allclose(np.linalg.norm(moved.half[0], axis=0), np.linalg.norm(first.half, axis=-1), atol=1e-12)
+    np.testing.assert_allclose(moved.centre[0].T, first.centre + 0.01 * velocity)
 
 
 def test_time_of_impact_closes_the_gap_or_is_the_limit() -> None:
     gap, approach = np.random.default_rng(8).normal(0.0, (0.05, 10.0), (500, 2)).T
-    time = np.asarray(contact.time_of_impact(jnp.asarray(gap), jnp.asarray(approach), 0.01))
+    time = np.asarray(collision.time_of_impact(jnp.asarray(gap), jnp.asarray(approach), 0.01))
     assert (time >= 0.0).all() and (time <= 0.01).all()
     assert (time[gap <= 0.0] == 0.0).all()
     assert (time[(gap > 0.0) & (approach < 0.0)] == 0.01).all()
@@ -241,8 +266,8 @@ def test_a_foot_that_crosses_the_ball_within_a_step_is_seen(scene: Scene) -> Non
     gap = 0.2 - scene.links[foot].radius - scene.links[ball].radius
 
     @jax.jit
-    def seen(state: Array, free: Array) -> Meeting:
-        return meetings(scene, state, morphology_of(scene)[None], free)[0][1]
+    def seen(state: Array, free: Array) -> ContactPoints:
+        return contact_points(scene, state, morphology_of(scene)[None], free)[0][1]
 
     touches = []
     for speed in (16.0, 0.9 * gap / scene.dt):

@@ -14,11 +14,11 @@ from jax import Array
 
 from larp_model import rotation
 from larp_model import state as packed
+from larp_model.detection import first_contacts
 from larp_model.engines.episodes import Episodes
 from larp_model.learned.model import Model, initial_weights
 from larp_model.learned.paper import PaperModel, Sizes
 from larp_model.learned.residual import ResidualModel, changes, true_motion
-from larp_model.meeting import first_contacts
 from larp_model.networks import Size, Weights
 from larp_model.physics.collision import ContactSettings
 from larp_model.physics.kinematics import kinematics, morphology_of

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
 from larp_model.bodies import human, human_and_ball
+from larp_model.detection import first_contacts
 from larp_model.engines.mujoco import Truth
-from larp_model.meeting import first_contacts
 from larp_model.physics import kinematics
 from larp_model.scene import Body
 from tasks.motions import references, styles

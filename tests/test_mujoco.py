@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
 from larp_model.bodies import ball, capsule, chain, human, standing_height
+from larp_model.detection import first_contacts
 from larp_model.engines.episodes import VERSION, Episodes, join, load, record, save
 from larp_model.engines.mujoco import SUBSTEPS, Truth, compile_model
 from larp_model.errors import InputError
-from larp_model.meeting import first_contacts
 from larp_model.physics import kinematics
 from larp_model.scene import Scene
 from tasks.data import smooth_noise, stray

@@ -17,11 +17,11 @@ from larp_model import designs, training
 from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.designs import DesignName
+from larp_model.detection import first_contacts
 from larp_model.engines.episodes import Episodes
 from larp_model.errors import InputError
 from larp_model.learned.model import initial_weights
 from larp_model.learned.residual import ResidualModel
-from larp_model.meeting import first_contacts
 from larp_model.networks import Size, Weights
 from larp_model.physics import kinematics
 from larp_model.training import Windows

@@ -8,9 +8,9 @@ import pytest
 
 from larp_model import state as packed
 from larp_model.bodies import human_and_ball
+from larp_model.detection import contact_points, first_contacts
 from larp_model.engines.episodes import Episodes, record
 from larp_model.engines.mujoco import Truth, closed
-from larp_model.meeting import first_contacts, meetings
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from tasks.data import overlaps
@@ -43,8 +43,8 @@ def truth(crossing: tuple[np.ndarray, np.ndarray]) -> Episodes:
 def gaps(scene: Scene, states: np.ndarray) -> np.ndarray:
     """Smallest gap (E, T) [m] of one leg to the other, in states (E, T, L, 13)."""
     flat = jnp.asarray(states).reshape(-1, *states.shape[2:])
-    [(_, met)] = meetings(scene.within, flat, jnp.asarray(scene.morphology)[None])
-    return np.asarray(met.gap.min(axis=1)).reshape(states.shape[:2])
+    [(_, points)] = contact_points(scene.within, flat, jnp.asarray(scene.morphology)[None])
+    return np.asarray(points.gap.min(axis=1)).reshape(states.shape[:2])
 
 
 def test_legs_stop_each_other_only_where_they_can_touch(

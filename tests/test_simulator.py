@@ -16,12 +16,12 @@ from larp_model import losses, rotation
 from larp_model import state as packed
 from larp_model.anatomy import Detail
 from larp_model.bodies import BALL_SURFACE, capsule, chain, human_and_ball
+from larp_model.detection import first_contacts
 from larp_model.engines.episodes import Episodes
 from larp_model.errors import InputError
 from larp_model.learned.model import Model
 from larp_model.learned.residual import ResidualModel
 from larp_model.losses import LossWeights
-from larp_model.meeting import first_contacts
 from larp_model.networks import Size, Weights
 from larp_model.physics.ball import SUBSTEPS
 from larp_model.physics.kinematics import morphology_of

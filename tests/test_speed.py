@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from larp_model.detection import contact_points
 from larp_model.engines.mujoco import Truth
 from larp_model.errors import InputError
-from larp_model.meeting import meetings
 from larp_model.physics.kinematics import morphology_of
 from larp_model.scene import Scene
 from tasks.benchmarks import engines, replays, report, speed
@@ -30,7 +30,7 @@ def near(what: Course) -> np.ndarray:
     states = np.concatenate([what.states[:, None], after], axis=1)
     times = range(what.controls.shape[1])
     pairs = [(jnp.asarray(states[:, t]), jnp.asarray(states[:, t + 1])) for t in times]
-    return np.array([(meetings(scene, before, shape, after)[0][1].near > 0.0).any() for before, after in pairs])
+    return np.array([(contact_points(scene, before, shape, after)[0][1].near > 0.0).any() for before, after in pairs])
 
 
 def test_a_struck_ball_is_near_a_link_in_every_timed_step() -> None:

@@ -17,12 +17,12 @@ from matplotlib.image import imread
 
 from larp_model import training
 from larp_model.bodies import chain
+from larp_model.detection import first_contacts
 from larp_model.engines.episodes import Episodes, record
 from larp_model.engines.mujoco import Truth
 from larp_model.errors import InputError
 from larp_model.learned.model import Model
 from larp_model.learned.paper import PaperModel, Sizes
-from larp_model.meeting import first_contacts
 from larp_model.networks import Size, Weights
 from larp_model.scene import Scene
 from larp_model.training import Batch, Recipe, Windows, statistics_of, train

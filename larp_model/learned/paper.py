@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model import contact, meeting, rotation
+from larp_model import detection, rotation
 from larp_model import state as packed
 from larp_model.learned.model import network_name
 from larp_model.networks import Measured, Perceptron, Size, Statistics, Weights, bounded, evaluate, side_by_side
+from larp_model.physics.collision import closest
 from larp_model.physics.kinematics import Kinematics, kinematics
 from larp_model.scene import Body, Pair, Scene
 
@@ -79,7 +80,7 @@ class PaperModel:
             touching = by_body[pair.first], by_body[pair.second]
             name = network_name("contact", *both)
             features = contact_inputs(pair, both, jax.lax.stop_gradient(touching) if stop_gradient else touching)
-            for body, links, of_link in zip(both, meeting.rows_of(pair, *both), features, strict=True):
+            for body, links, of_link in zip(both, detection.link_pairs(pair, *both), features, strict=True):
                 onto = jax.nn.one_hot(links, len(body.links), dtype=state.dtype)
                 push = jnp.einsum("bpf,pl->blf", evaluate(networks[name], weights, name, of_link), onto)
                 pushes[body.name] += push
@@ -112,10 +113,8 @@ class PaperModel:
         for pair, both in pairs_by_kind(scene):
             own = seen.of(scene, pair.first), seen.of(scene, pair.second)
             features = jnp.concatenate(contact_inputs(pair, both, own), axis=1)
-            met = meeting.meet(
-                pair, both, own, (before[:, scene.rows(pair.first)], before[:, scene.rows(pair.second)]), scene.dt
-            )
-            near = jnp.tile(met.near, (1, 2)).reshape(-1) + APART
+            points = detection.detect(pair, both, own, (own[0].state, own[1].state), scene.dt)
+            near = jnp.tile(points.near, (1, 2)).reshape(-1) + APART
             measured[network_name("contact", *both)] = (
                 Statistics.of(features.reshape(-1, features.shape[-1]), near), None
             )  # fmt: skip
@@ -154,18 +153,15 @@ def contact_inputs(pair: Pair, bodies: tuple[Body, Body], seen: tuple[Kinematics
     phi: position relative to the first body's root, quaternion, velocities, length, radius, mass. c(.): the contact
     point relative to the link, the normal and the distance, when the step begins.
     """
-    rows = meeting.rows_of(pair, *bodies)
-    found = contact.closest(*(meeting.segments(own, links) for own, links in zip(seen, rows, strict=True)))
+    rows = detection.link_pairs(pair, *bodies)
+    found = closest(*(detection.capsules(own, links) for own, links in zip(seen, rows, strict=True)))
     root = seen[0].position[:1] * jnp.array([[1.0], [1.0], [0.0]], seen[0].state.dtype)
 
-    def phi(own: Kinematics, links: np.ndarray) -> tuple[Array, Array]:
-        """Return the links' features (B, P, F), and where they are (B, P, 3) [m]."""
-        features = jnp.concatenate([own.position - root, own.state[:, 3:], own.sizes], axis=1)
-        by_link, places = (jnp.moveaxis(each[links], -1, 0) for each in (features, own.position))
-        return by_link, places
+    def phi(own: Kinematics, links: np.ndarray) -> Array:
+        return jnp.concatenate([own.position - root, own.state[:, 3:], own.sizes], axis=1)[links]
 
-    (first, at_first), (second, at_second) = (phi(*each) for each in zip(seen, rows, strict=True))
-    distance = found.distance[..., None]
-    by_first = jnp.concatenate([first, second, found.point - at_first, found.normal, distance], axis=-1)
-    by_second = jnp.concatenate([second, first, found.point - at_second, -found.normal, distance], axis=-1)
-    return by_first, by_second
+    first, second = (phi(*each) for each in zip(seen, rows, strict=True))
+    arms = [found.point - own.position[links] for own, links in zip(seen, rows, strict=True)]
+    by_first = jnp.concatenate([first, second, arms[0], found.normal, found.distance], axis=1)
+    by_second = jnp.concatenate([second, first, arms[1], -found.normal, found.distance], axis=1)
+    return jnp.moveaxis(by_first, -1, 0), jnp.moveaxis(by_second, -1, 0)

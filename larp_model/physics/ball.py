@@ -11,8 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from larp_model.contact import IMPEDANCE
-from larp_model.physics.contact import stuck_or_sliding
+from larp_model.physics.contact import IMPEDANCE, stuck_or_sliding
 from larp_model.physics.kinematics import Kinematics
 from larp_model.physics.motion import BodyMotion, moments
 from larp_model.scene import Body

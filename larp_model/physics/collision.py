@@ -1,6 +1,7 @@
-"""Pairs of links that can touch in a step: their smallest gaps, and their closest points.
+"""Where capsules are closest, when they touch within a step, and which links of a scene can.
 
-Arrays have the batch last, as in `linalg`.
+A ball is a capsule of length 0, so one description serves all pairs of links. Values and gradients stay finite for
+coincident, parallel and zero-length axes. Arrays have the batch last, as in `linalg`.
 """
 
 from __future__ import annotations
@@ -14,11 +15,95 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model.contact import Axis, nearest
-from larp_model.linalg import cross
+from larp_model.linalg import cross, dot
 from larp_model.physics.kinematics import Kinematics
 from larp_model.scene import Scene, Surface
-from larp_model.vector import Vector
+
+
+class Capsules(NamedTuple):
+    """Capsules by their axes: centre (n, 3, B) [m], half (n, 3, B) [m] from there to one end, radius (n, 1, B) [m]."""
+
+    centre: Array
+    half: Array
+    radius: Array
+
+
+class ClosestPoints(NamedTuple):
+    """Closest points of n pairs of capsules.
+
+    normal: unit vectors (n, 3, B) from the first to the second. distance: (n, 1, B) [m], negative where they overlap.
+    point: (n, 3, B) [m] midway between the surfaces. along: (n, 2, B) place on each axis, -1 to 1.
+    """
+
+    normal: Array
+    distance: Array
+    point: Array
+    along: Array
+
+
+def closest(first: Capsules, second: Capsules) -> ClosestPoints:
+    """Return the closest points of pairs of capsules (C. Ericson, Real-Time Collision Detection, 5.1.9).
+
+    Where axes are parallel the middle of their overlap is taken; where they cross or coincide, the normal is z.
+    """
+    between = first.centre - second.centre
+    aa, bb = dot(first.half, first.half), dot(second.half, second.half)
+    ab, ac, bc = dot(first.half, second.half), dot(first.half, between), dot(second.half, between)
+    aa, bb = jnp.where(aa < 1e-12, 1.0, aa), jnp.where(bb < 1e-12, 1.0, bb)  # every place on a ball's axis is one
+    determinant = aa * bb - ab * ab
+    parallel = determinant < 1e-6 * aa * bb
+    # On parallel axes every place of the overlap is closest: take its middle, projected on the first axis.
+    reach = jnp.abs(ab) / aa
+    low = jnp.maximum(-1.0, -ac / aa - reach)
+    high = jnp.minimum(1.0, -ac / aa + reach)
+    middle = jnp.clip(0.5 * (low + high), -1.0, 1.0)
+    crossing = jnp.clip((ab * bc - ac * bb) / jnp.where(parallel, 1.0, determinant), -1.0, 1.0)
+    s = jnp.where(parallel, middle, crossing)
+    t = jnp.clip((ab * s + bc) / bb, -1.0, 1.0)
+    s = jnp.where(parallel & (jnp.abs(t) < 1.0), s, jnp.clip((ab * t - ac) / aa, -1.0, 1.0))
+    on_first, on_second = first.centre + s * first.half, second.centre + t * second.half
+    apart = on_second - on_first
+    squared = dot(apart, apart)
+    zero = squared < 1e-20
+    length = jnp.sqrt(jnp.where(zero, 1.0, squared))
+    up = jnp.array([0.0, 0.0, 1.0], apart.dtype)[:, None]
+    normal = jnp.where(zero, up, apart / length)
+    distance = jnp.where(zero, 0.0, length) - first.radius - second.radius
+    point = 0.5 * (on_first + first.radius * normal + on_second - second.radius * normal)
+    return ClosestPoints(normal, distance, point, jnp.concatenate([s, t], axis=1))
+
+
+def advanced(capsules: Capsules, velocity: Array, angular_velocity: Array, time: Array) -> Capsules:
+    """Return capsules after times (n, 1, B) [s] at constant velocities (n, 3, B) [m/s] and [rad/s].
+
+    The axes turn to first order and keep their length.
+    """
+    half = capsules.half + time * cross(angular_velocity, capsules.half)
+    shrink = norm(capsules.half) / jnp.maximum(norm(half), 1e-12)
+    return Capsules(capsules.centre + time * velocity, shrink * half, capsules.radius)
+
+
+def norm(vector: Array) -> Array:
+    """Return lengths (n, 1, B) of vectors (n, 3, B), with gradient zero at zero."""
+    squared = dot(vector, vector)
+    zero = squared < 1e-20
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
+
+
+def time_of_impact(distance: Array, approach: Array, limit: Array | float) -> Array:
+    """Return times (*,) [s] until gaps `distance` close at speeds `approach`, within [0, limit]; else `limit`.
+
+    It jumps where bodies that part touch at just no distance: there alone no gradient is that of the differences.
+    """
+    closing = approach > 1e-3
+    time = jnp.maximum(distance, 0.0) / jnp.where(closing, approach, 1.0)
+    return jnp.where(closing | (distance <= 0.0), jnp.minimum(time, limit), limit)
+
+
+def smooth_gate(gap: Array, margin: float) -> Array:
+    """Return 1 where gap <= 0, 0 where gap >= margin, and smoothly between."""
+    x = jnp.clip(1.0 - gap / margin, 0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)
 
 
 @dataclass(frozen=True)
@@ -89,8 +174,8 @@ class Candidates:
         def at(time: Array) -> Array:
             position = seen.position + time * (seen.velocity + 0.5 * time * rates.acceleration)
             half = turned(seen.half, time * (seen.angular_velocity + 0.5 * time * rates.angular_acceleration))
-            one, two = ((position[rows], half[rows], seen.sizes[rows, 1]) for rows in (first, second))
-            return closest(one, two)[1]
+            one, two = (Capsules(position[rows], half[rows], seen.sizes[rows, 1:2]) for rows in (first, second))
+            return closest(one, two).distance[:, 0]
 
         times = jnp.linspace(0.0, dt, settings.moments, dtype=seen.state.dtype)
         return jnp.min(jax.lax.map(at, times), axis=0)
@@ -123,18 +208,6 @@ def sides_of(candidates: Candidates, chosen: Array) -> Sides:
     firsts, seconds = (frozenset(getattr(pair, end) for pair in scene.pairs) for end in ("first", "second"))
     owners = (*[firsts] * len(chosen), *[seconds] * len(chosen), *(frozenset([name]) for name in candidates.balls))
     return Sides(jnp.concatenate([*of_links, *of_balls]), owners)
-
-
-def closest(first: tuple[Array, Array, Array], second: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-    """Return normals (n, 3, B), gaps (n, B) and contact points (n, 3, B) of capsules (centre, half axis, radius)."""
-    one, two = (Axis(_vector(centre), _vector(half), radius) for centre, half, radius in (first, second))
-    normal, gap, point, _ = nearest(one, two)
-    along, at = (jnp.stack([each.x, each.y, each.z], axis=1) for each in (normal, point))
-    return along, gap, at
-
-
-def _vector(vectors: Array) -> Vector:
-    return Vector(vectors[:, 0], vectors[:, 1], vectors[:, 2])
 
 
 def turned(vector: Array, by: Array) -> Array:

@@ -27,9 +27,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from larp_model.contact import IMPEDANCE
 from larp_model.linalg import barrier, dot, inverse, mm, mv
 
+# The share of the constraint that is a spring; the rest follows the free motion (MuJoCo's impedance).
+IMPEDANCE = 0.99
 # Where the line search looks, in shares of a Newton step.
 SHARES = (0.015625, 0.0625, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0)
 

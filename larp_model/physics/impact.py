@@ -18,12 +18,21 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model.contact import IMPEDANCE
 from larp_model.linalg import cross, cross_columns, cross_rows, mv
 from larp_model.physics import contact
 from larp_model.physics.articulated import Momenta
-from larp_model.physics.collision import Candidates, ContactSettings, Rates, Sides, closest, picked, sides_of, turned
-from larp_model.physics.contact import ContactProblem
+from larp_model.physics.collision import (
+    Candidates,
+    Capsules,
+    ContactSettings,
+    Rates,
+    Sides,
+    closest,
+    picked,
+    sides_of,
+    turned,
+)
+from larp_model.physics.contact import IMPEDANCE, ContactProblem
 from larp_model.physics.kinematics import Kinematics
 from larp_model.physics.motion import Articulation, BodyMotion, moments
 from larp_model.physics.response import responses
@@ -226,15 +235,16 @@ class System:
         """Return arms (S, 3, B) [m] from sides to contact points, normals (C, 3, B), and gaps (C, 1, B) [m]."""
         pairs, radius = self.pairs, self.radius
         one, two = (
-            (moves.centre[each], moves.half[each], radius[each, 0]) for each in (slice(pairs), slice(pairs, 2 * pairs))
+            Capsules(moves.centre[side], moves.half[side], radius[side])
+            for side in (slice(pairs), slice(pairs, 2 * pairs))
         )
-        normal, gap, point = closest(one, two)
-        arms = jnp.concatenate([point, point]) - moves.centre[: 2 * pairs]
-        up = jnp.broadcast_to(jnp.asarray(UP, self.dtype), (self.balls, *normal.shape[1:]))
+        found = closest(one, two)
+        arms = jnp.concatenate([found.point, found.point]) - moves.centre[: 2 * pairs]
+        up = jnp.broadcast_to(jnp.asarray(UP, self.dtype), (self.balls, *found.normal.shape[1:]))
         height = moves.centre[2 * pairs :, 2:] - radius[2 * pairs :]
         # Contact points are midway between the surfaces.
         arms = jnp.concatenate([arms, -(radius[2 * pairs :] + 0.5 * height) * up])
-        return arms, jnp.concatenate([normal, up]), jnp.concatenate([gap[:, None], height])
+        return arms, jnp.concatenate([found.normal, up]), jnp.concatenate([found.distance, height])
 
     def gains(self, arms: Array) -> tuple[Array, Array]:
         """Return velocities and spins (2, n, 3, 3, B), kept and fading, of coupled sides by impulses at contacts."""

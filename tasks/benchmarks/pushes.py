@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from larp_model import contact
 from larp_model import state as packed
 from larp_model.bodies import ball, capsule, chain, human, kicking_links
 from larp_model.engines.mujoco import Truth
 from larp_model.engines.mujoco import finite as truth_finite
 from larp_model.errors import InputError
 from larp_model.physics import kinematics
+from larp_model.physics.collision import Capsules, closest
 from larp_model.scene import Pair, Scene
 from larp_model.simulator import Simulator
 from mpc import CostTerm, evaluate
@@ -474,10 +474,12 @@ def geometry() -> list[Row]:
 
     def distance(numbers: jax.Array) -> jax.Array:
         one, two = (
-            contact.Segment(numbers[n], numbers[n + 1], jnp.asarray(radius, numbers.dtype))
+            Capsules(
+                numbers[n][None, :, None], numbers[n + 1][None, :, None], jnp.full((1, 1, 1), radius, numbers.dtype)
+            )
             for n, radius in ((0, 0.1), (2, 0.05))
         )
-        return contact.closest(one, two).distance
+        return closest(one, two).distance[0, 0, 0]
 
     found = []
     for bits in (32, 64):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from larp_model import state as packed
-from larp_model.meeting import first_contacts
+from larp_model.detection import first_contacts
 from larp_model.simulator import Simulator
 from mpc import CEM, Dynamics, Gradient, evaluate
 from mpc.search import coloured_noise
