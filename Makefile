@@ -29,6 +29,7 @@ test: $(READY)
 
 lint: $(READY)
 	$(RUN) ruff check
+	$(RUN) ruff format --check
 	$(RUN) mypy
 
 kick: $(READY)

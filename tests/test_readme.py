@@ -1,4 +1,4 @@
-"""What the README says is so: its Python runs as it stands there, its commands take what they are given."""
+"""What the documents say is so: the README's Python runs as it stands there, commands take what they are given."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ import tyro
 
 from tasks.benchmarks.__main__ import NAMED
 
-README = Path(__file__).parents[1] / "README.md"
+ROOT = Path(__file__).parents[1]
+README, CONTRIBUTING = ROOT / "README.md", ROOT / "CONTRIBUTING.md"
 INSTALLED = {"larp-kick": "tasks.kick", "larp-train": "tasks.train", "larp-adapt": "tasks.adapt"}
 FENCED = re.compile(r"```[a-z]*\n(.*?)```", re.DOTALL)
 TEXT = README.read_text()
 LINES = [
     shlex.split(line, comments=True)
-    for block in [*FENCED.findall(TEXT), *re.findall(r"`([^`]+)`", FENCED.sub("", TEXT))]
+    for text in (TEXT, CONTRIBUTING.read_text())
+    for block in [*FENCED.findall(text), *re.findall(r"`([^`]+)`", FENCED.sub("", text))]
     for line in block.splitlines()
     if re.match(r"larp-(kick|train|adapt|bench) |\S*python -m tasks\.", line)
 ]
@@ -36,7 +38,7 @@ def idle(main: Callable[..., None]) -> Callable[..., None]:
 
 
 @pytest.mark.parametrize("line", LINES, ids=" ".join)
-def test_every_command_of_the_readme_takes_what_it_is_given(line: list[str]) -> None:
+def test_every_command_of_the_documents_takes_what_it_is_given(line: list[str]) -> None:
     module, given = (line[2], line[3:]) if line[1] == "-m" else (INSTALLED[line[0]], line[1:])
     if module.startswith("tasks.benchmarks"):
         given = [module.rpartition(".")[2], *given]
@@ -45,9 +47,16 @@ def test_every_command_of_the_readme_takes_what_it_is_given(line: list[str]) -> 
         tyro.cli(idle(import_module(module).main), args=given)
 
 
-def test_every_file_that_the_readme_names_exists() -> None:
-    for name in re.findall(r"\]\(([^)#]+)\)", TEXT):
-        assert (README.parent / name).exists(), name
+@pytest.mark.parametrize("document", [README, CONTRIBUTING], ids=lambda path: path.name)
+def test_every_file_that_a_document_links_exists(document: Path) -> None:
+    for name in re.findall(r"\]\(([^)#]+)\)", document.read_text()):
+        assert (ROOT / name).exists(), name
+
+
+def test_every_file_that_contributors_are_sent_to_exists() -> None:
+    rooms = (ROOT, ROOT / "larp_model", ROOT / "larp_model/physics")
+    for name in re.findall(r"`([\w/]+(?:\.py|/))`", CONTRIBUTING.read_text()):
+        assert any((room / name).exists() for room in rooms), name
 
 
 def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
