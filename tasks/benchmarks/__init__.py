@@ -1,0 +1,1 @@
+"""Benchmarks of the simulator, the planner, reconstruction of motion from keypoints, and the web page."""

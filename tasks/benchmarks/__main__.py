@@ -1,4 +1,4 @@
-"""All benchmarks under one command: `python -m tasks.benchmarks NAME`, or `larp-bench NAME`."""
+"""Command line of all benchmarks: `python -m tasks.benchmarks NAME`, or `larp-bench NAME`."""
 
 from collections.abc import Callable
 
@@ -20,7 +20,7 @@ NAMED: dict[str, Callable[..., None]] = {
 
 
 def cli() -> None:
-    """The command `larp-bench`."""
+    """Run the command `larp-bench`."""
     run(NAMED)
 
 

@@ -1,9 +1,9 @@
-"""One question about speed, answered in a process of its own: how long does an engine take for a step of a scene?
+"""Time that an engine takes for a step of a scene, measured in a process of its own.
 
     python -m tasks.benchmarks.engines '{"engine": "mujoco", "scene": "human", ...}'
 
-prints the answer as JSON in its last line. Every engine starts from the same states, recorded in MuJoCo, under the
-reference's joint targets, each row of the batch with a small offset of its own, as a planner's candidates have.
+prints the result as JSON in its last line. Every engine starts from the same states, recorded in MuJoCo, under the
+reference's joint targets. Each row of the batch has a small offset of its own, as a planner's candidates have.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from mpc.dynamics import BatchedTruth
 from tasks.benchmarks import report
 from tasks.motions.references import embedded
 
-# A row is the median of so many runs of so many steps, or of as many as fit into these seconds.
+# A row is the median of `RUNS` runs of `STEPS` steps, or of as many as fit into `SECONDS`.
 STEPS, RUNS, SECONDS = 100, 5, 3.0
 # Steps through which a gradient is taken.
 GRADIENT_STEPS = 60
-# The strike: it begins so many steps before the ball moves, and for so many a link is near the ball.
+# The strike: steps that it begins before the ball moves, and steps for which a link is near the ball.
 BEFORE_STRIKE, STRIKE_STEPS = 1, 3
-# A ball out of reach is so far away [m].
+# Distance of a ball that is out of reach [m].
 AWAY = 100.0
 # Spread of the offsets of joint targets [rad].
 OFFSETS = 0.02
-# A ball in flight, so many steps after the strike.
+# Steps after the strike at which a ball in flight starts.
 FLYING = 8
 PIPELINES = ("generalized", "spring", "positional")
 
@@ -60,7 +60,7 @@ Leaves = Any
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked: an engine's time for a step of `scene.dt`, or for a gradient through `GRADIENT_STEPS` of them.
+    """Request for an engine's time for a step of `scene.dt`, or for a gradient through `GRADIENT_STEPS` of them.
 
     scene: ball, human or human_ball. reach: of the latter, "far" or "struck", else None. substeps: engine steps in a
     step; 1 for the learned simulator. seed: of the offsets of joint targets.
@@ -76,30 +76,30 @@ class Question:
 
     @property
     def coarse(self) -> bool:
-        """Whether the engine runs at a step with which a kick is not converged."""
+        """Return whether a kick is not converged with this engine at this number of engine steps."""
         return self.engine != "larp" and self.substeps < SUBSTEPS
 
     @property
     def name(self) -> str:
-        """The question in a few words."""
+        """Return a short description of engine, scene and batch."""
         what = " gradient" if self.gradient else ""
         return f"{titled(self.engine, self.substeps)}{what}, {case(self.scene, self.reach)}, batch {self.batch}"
 
 
 def titled(engine: str, substeps: int) -> str:
-    """An engine's name with its engine steps."""
+    """Return an engine's name with its engine steps; LARP's without."""
     return NAMES[engine] if engine == "larp" else f"{NAMES[engine]} {substeps}"
 
 
 def case(scene: str, reach: str | None) -> str:
-    """A scene's name with where its ball is."""
+    """Return a scene's name with the reach of its ball, if any."""
     return " ".join(filter(None, (scene, reach)))
 
 
 class Course(NamedTuple):
-    """A scene, its states (N, L, 13) to begin with and joint targets (N, T, J, 3) [rad] for T steps.
+    """A scene with start states (N, L, 13) and joint targets (N, T, J, 3) [rad] for T steps.
 
-    After T steps it begins again.
+    After T steps it starts over.
     """
 
     scene: Scene
@@ -108,11 +108,11 @@ class Course(NamedTuple):
 
 
 def course(question: Question) -> Course:
-    """What every engine simulates.
+    """Return the scene, start states and joint targets that every engine simulates.
 
     ball: in flight, after the reference's strike. human: the reference. human_ball far: the reference, with the ball
     100 m away. human_ball struck: the three steps around the strike, in each of which a link is near the ball, over and
-    over; where a gradient is asked for, the reference from its start, with the strike in it.
+    over; for a gradient, the reference from its start, which includes the strike.
     """
     whole = human_and_ball()
     reference = embedded(whole)
@@ -135,9 +135,9 @@ def course(question: Question) -> Course:
 
 
 class Traced(NamedTuple):
-    """An engine that JAX compiles: where a batch begins, and the step of what it carries on.
+    """Functions of an engine that JAX compiles: initialise a batch, step it, and read its ball.
 
-    start: states (N, L, 13) -> what it begins with. enter: that -> carried. step: carried, joint targets (N, J, 3) ->
+    start: states (N, L, 13) -> initial arrays. enter: these -> carried. step: carried, joint targets (N, J, 3) ->
     carried. ball: carried -> position and velocity (N, 6) [m, m/s] of the scene's last body, a ball.
     """
 
@@ -148,7 +148,7 @@ class Traced(NamedTuple):
 
 
 def larp(scene: Scene, substeps: int) -> Traced:
-    """The simulator that ships."""
+    """Return LARP's simulator of physics alone."""
     simulator = Simulator.of_physics(scene)
 
     def ball(state: Array) -> Array:
@@ -158,7 +158,7 @@ def larp(scene: Scene, substeps: int) -> Traced:
 
 
 def mjx(scene: Scene, substeps: int) -> Traced:
-    """MuJoCo in JAX, with the model that MuJoCo has."""
+    """Return MJX, MuJoCo in JAX, with the same model as MuJoCo."""
     from mujoco import mjx
 
     compiled = compile_model(scene, substeps)
@@ -182,7 +182,7 @@ def mjx(scene: Scene, substeps: int) -> Traced:
 
 
 def brax(pipeline: str, scene: Scene, substeps: int) -> Traced:
-    """One of Brax's pipelines, with MuJoCo's model: its pyramids for friction cones and its Euler steps are allowed."""
+    """Return one of Brax's pipelines, with MuJoCo's model but pyramidal friction cones and Euler integration."""
     import importlib
 
     import mujoco
@@ -213,19 +213,19 @@ def _coordinates(scene: Scene, states: np.ndarray) -> tuple[Array, Array]:
 
 
 def _last(position: Array, velocity: Array) -> Array:
-    """Position and velocity (N, 6) of the last body, a free one, from MuJoCo's coordinates."""
+    """Return position and velocity (N, 6) [m, m/s] of the last body, a free one, from MuJoCo's coordinates."""
     return jnp.concatenate([position[:, -7:-4], velocity[:, -6:-3]], axis=-1)
 
 
 def bullet(scene: Scene, substeps: int, batch: int) -> BatchedTruth:
-    """Bullet, behind the same door as the truth."""
+    """Return Bullet, with the same interface as the ground truth."""
     from larp_model.engines.bullet import BulletTruth
 
     return BulletTruth(scene, batch, substeps)
 
 
 def mujoco(scene: Scene, substeps: int, batch: int) -> BatchedTruth:
-    """The truth, on all cores."""
+    """Return the ground truth, MuJoCo, on all cores."""
     return Truth(scene, batch, substeps)
 
 
@@ -238,18 +238,18 @@ STEPPED: dict[str, Callable[[Scene, int, int], BatchedTruth]] = {"mujoco": mujoc
 
 
 class Refused(Exception):
-    """Why there is no figure."""
+    """Raised with the reason why an engine has no figure."""
 
 
 class Compiled(NamedTuple):
-    """A compiled program and the seconds that took."""
+    """A compiled program with the compilation time [s]."""
 
     run: Callable[..., Any]
     seconds: float
 
 
 def compiled(program: Callable[..., Any], *arguments: Any) -> Compiled:
-    """The program compiled for these arguments; refuses one that this machine's memory cannot hold."""
+    """Compile a program for these arguments; raise Refused if it needs more memory than is free."""
     begin = time.perf_counter()
     ready = jax.jit(program).lower(*arguments).compile()
     seconds = time.perf_counter() - begin
@@ -262,7 +262,7 @@ def compiled(program: Callable[..., Any], *arguments: Any) -> Compiled:
 
 
 def available_memory() -> int | None:
-    """Bytes that a program may still take on JAX's first device; None where nobody says so."""
+    """Return the free memory [bytes] of JAX's first device; None where it is unknown."""
     device = jax.devices()[0]
     if device.platform != "cpu":
         found = device.memory_stats() or {}
@@ -272,9 +272,9 @@ def available_memory() -> int | None:
 
 
 def peak_memory() -> float:
-    """The most memory that this process has ever held [MiB].
+    """Return the peak memory of this process [MiB].
 
-    Linux hands `ru_maxrss` on to the programs that a process starts, so that a small child would show its parent's.
+    On Linux, child programs inherit `ru_maxrss`, so that a small child would show its parent's; `VmHWM` is read there.
     """
     stated = _stated(Path("/proc/self/status"), "VmHWM")
     if stated is not None:
@@ -284,16 +284,16 @@ def peak_memory() -> float:
 
 
 def _stated(path: Path, field: str) -> int | None:
-    """A field [KiB] of one of Linux's tables."""
+    """Return a field [KiB] of a table in Linux's /proc; None where there is none."""
     found = re.search(rf"^{field}:\s+(\d+)", path.read_text(), re.MULTILINE) if path.exists() else None
     return int(found.group(1)) if found else None
 
 
 def timed(run: Callable[[int], float], unit: int, most: int) -> report.Row:
-    """Milliseconds a step: the median of `RUNS` runs of `most` steps, or of what fits into `SECONDS`.
+    """Return the milliseconds per step: median and range of `RUNS` runs of `most` steps, or of fewer within `SECONDS`.
 
-    run: seconds that so many steps take, a multiple of `unit`. Its first call is not counted, unless it alone takes
-    all the time.
+    run: number of steps, a multiple of `unit` -> seconds that they take. Its first call is not counted, unless it alone
+    takes longer than `SECONDS`.
     """
     first = run(unit)
     if first > SECONDS:
@@ -312,7 +312,7 @@ def timed(run: Callable[[int], float], unit: int, most: int) -> report.Row:
 
 
 def time_traced(question: Question, what: Course) -> report.Row:
-    """Time of an engine that JAX compiles; see `timed`."""
+    """Measure a step of an engine that JAX compiles; see `timed`."""
     traced = TRACED[question.engine](what.scene, question.substeps)
     start, controls = traced.start(what.states), jnp.moveaxis(jnp.asarray(what.controls), 1, 0)
     again = len(controls)
@@ -342,9 +342,9 @@ def time_traced(question: Question, what: Course) -> report.Row:
 
 
 def time_gradient(question: Question, what: Course) -> report.Row:
-    """Time of `GRADIENT_STEPS` steps forward, and of these with the gradient by start and joint targets.
+    """Measure `GRADIENT_STEPS` steps forward, and the same steps with the gradient by start and joint targets.
 
-    What is differentiated is the sum of squares of all that the engine carries at the end.
+    The function that is differentiated is the sum of squares of all that the engine carries at the end.
     """
     traced = TRACED[question.engine](what.scene, question.substeps)
     start, controls = traced.start(what.states), jnp.moveaxis(jnp.asarray(what.controls), 1, 0)
@@ -378,12 +378,12 @@ def _differentiable(leaf: Array) -> bool:
 
 
 def finite(leaves: Leaves) -> bool:
-    """Whether all numbers are."""
+    """Return whether all numbers of all leaves are finite."""
     return all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(leaves))
 
 
 def time_stepped(question: Question, what: Course) -> report.Row:
-    """Time of an engine outside JAX; putting it into its start is not counted."""
+    """Measure a step of an engine outside JAX; resetting it to its start is not counted."""
     engine: Any = STEPPED[question.engine](what.scene, question.substeps, question.batch)
     again = what.controls.shape[1]
     last = what.states
@@ -404,7 +404,7 @@ def time_stepped(question: Question, what: Course) -> report.Row:
 
 
 def answer(question: Question) -> report.Row:
-    """The row: time, compilation and memory, or `refused`, the reason why there is none."""
+    """Return the row of a question: time, compilation and memory, or in `refused` the reason why there is none."""
     idle, compiles = peak_memory(), question.engine in TRACED
     row = asdict(question) | {"device": jax.devices()[0].device_kind if compiles else "cpu", "refused": None}
     take_time = time_gradient if question.gradient else time_traced if compiles else time_stepped
@@ -413,7 +413,7 @@ def answer(question: Question) -> report.Row:
         row |= take_time(question, what)
     except ImportError as error:
         row["refused"] = f"is not installed ({error.name or error})"
-    except Exception as error:  # an engine may refuse in any way: what it says is the answer
+    except Exception as error:  # an engine may fail in any way: its message is the result
         row["refused"] = words(error)
     else:
         row["us_per_scene_step"] = 1e3 * row["ms_per_step"] / question.batch
@@ -422,7 +422,7 @@ def answer(question: Question) -> report.Row:
 
 
 def words(error: Exception) -> str:
-    """What an error says, in one line."""
+    """Return an error's message in one line of less than 160 characters."""
     said = (str(error).strip() or type(error).__name__).splitlines()[0]
     return said if len(said) < 160 else f"{said[:157]}..."
 

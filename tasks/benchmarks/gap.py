@@ -1,6 +1,6 @@
-"""What the model gets wrong about the planner's own candidates: their order, and how the ball leaves.
+"""Model errors on the planner's own candidates: order of their costs, and launch of the ball.
 
-A planner seeks out the states in which its model is wrong, so that errors on random data say little.
+A planner seeks out the states in which its model is wrong, so that errors on random data are little evidence.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ MARKS = ("#0072b2", "#e69f00", "#d55e00")
 def candidates_of(
     kick: Kick, models: Models, truth: Models, targets: int, candidates: int, seed: int
 ) -> tuple[list[dict[str, Any]], Episodes]:
-    """Model cost and truth cost of candidates around each first, middle and last plan; and what truly happened.
+    """Return model cost and ground-truth cost of candidates around each first, middle and last plan.
 
-    Returns a row for each plan, and the episodes of all candidates.
+    Returns a row for each plan, and the ground-truth episodes of all candidates.
     """
     planners = kick.planners_of(preset_of("balanced"), models)
     spread, random = planners.first.scale, np.random.default_rng(seed)
@@ -93,7 +93,7 @@ def candidates_of(
 
 
 def picture(rows: list[dict[str, Any]]) -> Figure:
-    """Model cost against truth cost of all candidates, by how far off the strike was."""
+    """Plot the cost in MuJoCo over the model's, of all candidates of first, middle and last plans."""
     figure = Figure(figsize=(7, 6), layout="constrained")
     axes = figure.subplots()
     steps = np.array([row["step"] for row in rows])

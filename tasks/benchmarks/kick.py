@@ -1,4 +1,4 @@
-"""How far from its target the kicked ball really passes: many kicks, executed in MuJoCo."""
+"""Misses of planned kicks to random targets, executed in MuJoCo."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ WITHIN = (0.1, 0.25, 0.5)
 
 
 def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """The figures of a set of kicks."""
+    """Return the figures of a set of kicks."""
     truth = np.array([row["truth_error_m"] for row in rows])
     limit = np.array([row["limit_error_m"] for row in rows])
     halved = np.array([row["halved_error_m"] for row in rows])
@@ -57,7 +57,7 @@ def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def picture(rows: list[dict[str, Any]], title: str) -> Figure:
-    """Where the targets were and how far each was missed; believed against true."""
+    """Plot the targets coloured by miss, and the misses in MuJoCo against those that the model expected."""
     figure = Figure(figsize=(12, 5), layout="constrained")
     figure.suptitle(title)
     above, gap = figure.subplots(1, 2)

@@ -1,4 +1,4 @@
-"""Error of the learned simulator against the truth, by horizon, and of the ball's launch."""
+"""Errors of the learned simulator against the ground truth, by horizon, and of the ball's launch."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from tasks.benchmarks import report
 from tasks.command import prepare_jax, run
 from tasks.scenarios import Scenario, around, scenario, trained_at
 
-# A step is timed with so many scenes side by side, over so many steps.
+# Batch sizes at which a step is timed, and steps of each timed rollout.
 BATCHES, TIMED = (1, 64, 512), 40
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 
 
 def picture(windows: dict[str, dict[str, float]], chosen: Scenario, title: str) -> Figure:
-    """Error over horizon, ours and the paper's."""
+    """Plot the position error over the horizon, ours and the paper's."""
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots()
     steps, paper = [int(n) for n in windows], dict(chosen.paper)
@@ -135,7 +135,10 @@ def main(
 
 
 def judged(manifest: Path | None, chosen: Scenario, episodes: Episodes) -> dict[str, Any]:
-    """Return errors of some weights, or of physics alone (see `evaluation.evaluate`), and the time of a step."""
+    """Return errors of weights, or of physics alone without a manifest, and the time of a step per batch size.
+
+    See `evaluation.evaluate`.
+    """
     scene = chosen.scene
     simulator = Simulator.of_physics(scene) if manifest is None else Simulator.load(manifest, scene)
     found = evaluation.evaluate(simulator, episodes, chosen.windows)
@@ -143,10 +146,10 @@ def judged(manifest: Path | None, chosen: Scenario, episodes: Episodes) -> dict[
 
 
 def second_opinion(scene: Scene, episodes: Episodes, windows: Sequence[int]) -> dict[str, dict[str, float | None]]:
-    """How far Bullet strays from the truth over the first n steps; see `evaluation.evaluate`. Needs the extra `bullet`.
+    """Return Bullet's position errors against the ground truth over the first n steps; see `evaluation.evaluate`.
 
-    Two engines that agree on the equations differ in how contacts give way and rub: no model of one of them needs to
-    be better than that.
+    Needs the extra `bullet`. Two engines that agree on the equations differ in contact compliance and friction: a
+    model of one of them need not be more accurate than that difference.
     """
     longest, parts = max(windows), []
     for row in range(len(episodes.states)):
@@ -160,7 +163,7 @@ def second_opinion(scene: Scene, episodes: Episodes, windows: Sequence[int]) -> 
 
 
 def step_time(simulator: Simulator, episodes: Episodes, size: int, runs: int = 5) -> float:
-    """Time of a step of one scene [us], of so many side by side over the first steps of episodes; the median."""
+    """Return the median time of a step per scene [us], in a batch of `size` over the first steps of episodes."""
     rows = np.arange(size) % len(episodes.states)
     given = episodes.states[rows, 0], episodes.controls[rows, :TIMED], episodes.torques[rows, :TIMED]
     state, controls, torques, sizes = (jnp.asarray(each) for each in (*given, episodes.morphology[rows]))
@@ -174,12 +177,12 @@ def step_time(simulator: Simulator, episodes: Episodes, size: int, runs: int = 5
 
 
 def said(value: float | None, how: str, unit: str) -> str:
-    """A mean with its unit, or that there is none."""
+    """Return a mean with its unit as text, or "all diverged" for None."""
     return "all diverged" if value is None else f"{value:{how}} {unit}"
 
 
 def table_of(found: dict[str, Any], chosen: Scenario) -> Table:
-    """What `evaluation.evaluate` found, as rows."""
+    """Return a table of the errors that `judged` returns, beside the paper's and, if present, others'."""
     table, paper = (
         Table("measure", *(f"{n} steps" for n in chosen.windows), title=f"Model: {chosen.name}"),
         chosen.paper,
@@ -209,7 +212,7 @@ def table_of(found: dict[str, Any], chosen: Scenario) -> Table:
 
 
 def launch_tables(found: dict[str, Any]) -> Iterator[Table]:
-    """Errors of launches, all and by kind, from so many steps before contact: a table each; see `Launches.summary`."""
+    """Yield a table of launch errors, all and by kind, per number of steps before contact; see `Launches.summary`."""
     for before, launch in found.items():
         if not launch["count"]:
             continue

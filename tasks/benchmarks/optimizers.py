@@ -1,4 +1,4 @@
-"""What gradients are worth: ways to search, alone and together, given the same time in the learned simulator."""
+"""Comparison of optimisers, sampling, gradients and both, with the same planning time in the learned simulator."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tasks.presets import Preset, Stage
 
 SAMPLING, SOME = CEM(samples=64, rounds=16, elites=12, decay=1.0), CEM(samples=32, rounds=4, elites=8, decay=1.0)
 FORWARD = GaussNewton(rounds=12, jacobian="forward")
-# By name: the first plan and each replan, before they are fitted into the time.
+# By name: optimisers of the first plan and of each replan, before they are scaled to the time.
 WAYS: dict[str, tuple[Stage, Stage]] = {
     "CEM": ((SAMPLING,), (CEM(samples=32, rounds=5, elites=12, decay=1.0),)),
     "MPPI": ((MPPI(samples=64, rounds=16),), (MPPI(samples=32, rounds=5),)),
@@ -30,7 +30,7 @@ WAYS: dict[str, tuple[Stage, Stage]] = {
 
 
 def compare(kick: Kick, name: str, weights: Path | None, seconds: float, targets: int, seed: int) -> report.Row:
-    """A way to search, its first plan fitted into `seconds` and each replan into a fifth of them."""
+    """Measure an optimiser, its first plan scaled to `seconds` and each replan to a fifth of them."""
     first, again = WAYS[name]
     models = models_of(kick.scene, "larp", weights)
     preset = kick.within(Preset(first, again, every=5), seconds, models, USUAL)
@@ -38,7 +38,7 @@ def compare(kick: Kick, name: str, weights: Path | None, seconds: float, targets
 
 
 def table_of(rows: list[report.Row], seconds: float) -> Table:
-    """A row a way."""
+    """Return a table with one row per optimiser."""
     table = Table(
         "search", "error, mean +- standard error", "median", "worst", "cost of the first plan", "first plan", "replan",
         title=f"What gradients are worth, in {seconds:g} s",

@@ -1,7 +1,7 @@
-"""What watching costs: plans with a page and its clients beside plans without, and what a page leaves behind.
+"""Cost of the live web page: planning times with and without watching clients, and resources that it leaves behind.
 
-Clients are websockets that say where they look from, take everything and draw nothing, some of them slowly; some leave
-and come back. They run in a process of their own, as browsers do.
+Clients are websockets that send a camera pose, receive every message and draw nothing. Some read slowly; some leave
+and reconnect. They run in a process of their own, as browsers do.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ from tasks.live import Choices, Live, due, weights_for
 from tasks.presets import PRESETS, PresetName
 from viewer import LivePage
 
-# Every so many clients one is slow: it waits so long before each message [s].
+# One in `SLOW` clients is slow: it waits `PATIENCE` [s] before each message.
 SLOW, PATIENCE = 5, 0.5
-# A client that comes again stays for so long [s].
+# Duration of a visit of the client that reconnects again and again [s].
 STAYS = 3.0
 WARM_UP = 3
-# Where a client looks from: as long as it does not say, Viser does not count it as one.
+# Camera pose of a client: Viser does not count a client before it has sent one.
 LOOKS = msgspec.msgpack.encode(
     ViewerCameraMessage(
         wxyz=(1.0, 0.0, 0.0, 0.0),
@@ -59,7 +59,7 @@ LOOKS = msgspec.msgpack.encode(
 
 
 def watch(address: str, clients: int, visits: Synchronized[int]) -> None:
-    """Be so many clients until ended; one more comes, stays a while and leaves, on and on: these visits are counted."""
+    """Connect `clients` clients until the process ends, and one more that visits repeatedly and counts in `visits`."""
 
     def one(number: int, seconds: float) -> None:
         end = time.monotonic() + seconds
@@ -86,7 +86,10 @@ def watch(address: str, clients: int, visits: Synchronized[int]) -> None:
 
 
 def until(what: Callable[[], object], seconds: float = 120.0) -> float:
-    """Wait until something is so, which is asked rarely, for asking takes those who plan some; returns how long [s]."""
+    """Wait until a condition is true and return the time that took [s].
+
+    The condition is polled rarely, for polling takes time from the planner. Raises RuntimeError after `seconds`.
+    """
     begin = time.monotonic()
     while not what():
         if time.monotonic() - begin > seconds:
@@ -96,7 +99,7 @@ def until(what: Callable[[], object], seconds: float = 120.0) -> float:
 
 
 def of_kick(live: Live, ask: Callable[[], None]) -> report.Row:
-    """A kick on the page: what its plans took, its miss, and how often it was drawn from first to last step [1/s]."""
+    """Return planning times, miss and frame rate from first to last step [1/s] of a kick on the page."""
     page, before = live.page, live.run
     drawn = list[tuple[float, int]]()
     ask()
@@ -118,7 +121,7 @@ def of_kick(live: Live, ask: Callable[[], None]) -> report.Row:
 
 
 def of_drag(live: Live, target: np.ndarray) -> report.Row:
-    """The target dragged: how long it took until the new plan was drawn [s]."""
+    """Drag the target and return the time until the new plan is drawn [s]."""
     page = live.page
     begin, plans = time.monotonic(), live.plans
     page.aim(target)
@@ -173,7 +176,7 @@ def main(
         for _ in range(WARM_UP):
             of_kick(live, partial(page.ask, "kick"))
         memory = process.memory_info().rss
-        # In turn, for the machine may be slower later on.
+        # Watched and unwatched kicks alternate, for the machine may become slower.
         jobs: dict[str, Callable[[], report.Row]] = {}
         for index, target in enumerate(targets):
             jobs[f"drag {index}"] = partial(of_drag, live, target)
@@ -219,7 +222,10 @@ def main(
 
 
 def headless(live: Live, kick: Kick, target: np.ndarray, preset: PresetName, seed: int) -> report.Row:
-    """The same kick at the same pace, that of time, while nothing is drawn: planning after a rest is slower anyway."""
+    """Return planning times of the same kick in real time without drawing.
+
+    The pace is the same as on the page because planning after a pause is slower anyway.
+    """
     begun = time.monotonic()
 
     def observe(execution: Execution) -> None:
@@ -234,7 +240,7 @@ def headless(live: Live, kick: Kick, target: np.ndarray, preset: PresetName, see
 
 
 def summary(rows: dict[str, report.Row]) -> dict[str, Any]:
-    """The figures of all rows."""
+    """Return medians and worst values over all rows."""
 
     def values(kind: str, name: str) -> np.ndarray:
         return np.array([row[name] for key, row in rows.items() if key.startswith(kind)])
@@ -253,7 +259,7 @@ def summary(rows: dict[str, report.Row]) -> dict[str, Any]:
 
 
 def picture(rows: dict[str, report.Row]) -> Figure:
-    """Replans of each kick, watched and alone."""
+    """Plot the median replan time of each kick, watched and alone."""
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.subplots()
     for kind, colour in (("watched", "#d55e00"), ("alone", "#0072b2")):

@@ -1,4 +1,4 @@
-"""Motion from keypoints against the motion that was filmed: captured clips, seen by synthetic cameras, or AIST++."""
+"""Errors of motion from keypoints against the filmed motion: clips seen by synthetic cameras, or AIST++."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from tasks.motions.references import embedded, motion_of
 from tasks.pose import reconstruct, shown
 from tasks.presets import PresetName
 
-# Frames a second of a synthetic film, and of it what lies before a kick's strike, as a share.
+# Frame rate of a synthetic film [1/s], and the share of it before a kick's strike.
 RATE, BEFORE = 60.0, 0.63
 Way = Literal["kinematic", "larp", "mujoco", "mujoco_timed"]
 WAYS: tuple[Way, ...] = ("kinematic", "larp", "mujoco")
 COLORS = {"kinematic": "#9aa5b1", "larp": "#1f6fb2", "mujoco": "#e69f00", "mujoco_timed": "#b3541e"}
-# What is told of each way: its name in the JSON, what a person reads, and its unit.
+# Figures of each way by their name in the JSON: title and unit in the table.
 TOLD = {
     "mpjpe_g_mm": ("MPJPE-G", "mm"),
     "mpjpe_mm": ("MPJPE", "mm"),
@@ -69,9 +69,9 @@ EASY = (
 
 
 class Film(NamedTuple):
-    """What is reconstructed, and what it is judged by.
+    """A film to reconstruct, with its ground truth.
 
-    clip: its name. lens: the camera, which is known. true: points (T, P, 3) [m], NaN where they are not known.
+    clip: name. lens: the camera, which is known. true: points (T, P, 3) [m], NaN where they are not known.
     """
 
     clip: str
@@ -81,7 +81,7 @@ class Film(NamedTuple):
 
 
 def filmed_points(clip: Path | None, seconds: float) -> np.ndarray:
-    """Points (T, P, 3) [m] of so many seconds around a clip's strike, or of its middle where it is no kick.
+    """Return points (T, P, 3) [m] of some seconds around a clip's strike, or of its middle where it is no kick.
 
     clip: BVH or npz; the embedded kick, performed in the truth, by default.
     """
@@ -103,7 +103,7 @@ def filmed_points(clip: Path | None, seconds: float) -> np.ndarray:
 
 
 def of_clip(clip: Path | None, camera: int, seconds: float, seed: int) -> Film:
-    """So many seconds of a clip, seen by a synthetic camera and detector."""
+    """Return a film of some seconds of a clip, seen by a synthetic camera and detector."""
     true = filmed_points(clip, seconds)
     random = np.random.default_rng((seed, camera))
     lens = filmed.camera_around(random, true)
@@ -112,7 +112,7 @@ def of_clip(clip: Path | None, camera: int, seconds: float, seed: int) -> Film:
 
 
 def of_dance(folder: Path, sequence: str, camera: int, seconds: float) -> Film:
-    """The first seconds of a dance of AIST++, seen by one of its cameras."""
+    """Return a film of the first seconds of a dance of AIST++, seen by one of its cameras."""
     name = dances.video(sequence, camera)
     keypoints, lens, true = dances.load(folder, sequence, camera)
     begun = keypoints.cut(0, round(seconds * keypoints.rate) - 1)
@@ -127,9 +127,9 @@ def of_dance(folder: Path, sequence: str, camera: int, seconds: float) -> Film:
 
 
 def dances_of(folder: Path, names: Sequence[str], cameras: int, seconds: float) -> dict[str, Callable[[], Film]]:
-    """Films of AIST++ by the names of their videos: those named, and of sequences named the first cameras.
+    """Return loaders of films of AIST++, by video: the videos named, and the first cameras of the sequences named.
 
-    Refuses what is missing or damaged in any of them.
+    Loads each film once, to raise an error if one is missing or damaged.
     """
     there = sorted(dances.sequences(folder).keys() & {path.stem for path in (folder / "keypoints2d").glob("*.pkl")})
     names = names or [video for video in EASY if dances.seen_by(video)[0] in there] or there
@@ -145,7 +145,7 @@ def dances_of(folder: Path, names: Sequence[str], cameras: int, seconds: float) 
 
 
 def as_fast(preset: physical.FitPreset, share: float) -> physical.FitPreset:
-    """A preset of which each plan tries a share of the candidates, in one round."""
+    """Return a preset with which each plan tries a share of the candidates, in one round."""
     steps = preset.steps
     tried = 1 + steps.rounds * (steps.directions + len(FACTORS))
     directions = max(1, round(share * tried) - 1 - len(FACTORS))
@@ -153,7 +153,7 @@ def as_fast(preset: physical.FitPreset, share: float) -> physical.FitPreset:
 
 
 def measured(film: Callable[[], Film], ways: Sequence[Way], preset: physical.FitPreset, seed: int) -> dict[str, Any]:
-    """One film, reconstructed in each way."""
+    """Reconstruct a film in each way and return its errors."""
     name, keypoints, lens, true = film()
     lifted = lift.lift(keypoints, lens)
 
@@ -189,12 +189,12 @@ def measured(film: Callable[[], Film], ways: Sequence[Way], preset: physical.Fit
 
 
 def means(rows: list[dict[str, Any]], way: Way) -> dict[str, float]:
-    """Of each figure of a way, over all films."""
+    """Return the mean over all films of each figure of a way."""
     return {name: float(np.mean([row[way][name] for row in rows])) for name in TOLD if name in rows[0][way]}
 
 
 def picture(rows: list[dict[str, Any]], ways: Sequence[Way]) -> Figure:
-    """Position errors of every film, way by way."""
+    """Plot the position errors of every film, by way."""
     figure = Figure(figsize=(9.0, 4.0), layout="constrained")
     axes = figure.subplots(1, 3, sharey=True)
     for each, name in zip(axes, ("mpjpe_g_mm", "mpjpe_mm", "mpjpe_pa_mm"), strict=True):

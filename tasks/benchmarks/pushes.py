@@ -1,6 +1,6 @@
-"""What the learned simulator and the engine are pushed through: sizes, states, precision, batches, horizons, scenes.
+"""Stress cases of the simulator and the engine: sizes, states, precision, batches, horizons, geometry, scenes.
 
-Every function gives rows {axis, value, promise, seen, held}; a promise is a number that can be missed.
+Cases are rows {axis, value, promise, seen, held}; a promise is a quantitative bound that can be violated.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from tasks.benchmarks.report import Row
 from tasks.kick import Kick
 
 STEPS = 48
-# No link of a kick is ever faster [m/s]; MuJoCo's trajectories count as diverged beyond it.
+# Speed [m/s] that no link of a kick exceeds; MuJoCo's trajectories count as diverged beyond it.
 FASTEST = 100.0
 FACTORS = (0.1, 0.2, 0.5, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 2.0, 5.0, 10.0)
 # How far the links may on average be from the engine's over 48 steps [m], and joints from being closed.
@@ -50,35 +50,35 @@ KINDS = (
 
 
 class Bench(NamedTuple):
-    """What is pushed: the kick's task and the learned simulator of its scene."""
+    """Subject of the stress cases: the kick's task and the learned simulator of its scene."""
 
     kick: Kick
     model: Simulator
 
     @property
     def controls(self) -> np.ndarray:
-        """The reference's joint targets (48, J, 3) [rad]."""
+        """Return the reference's joint targets (48, J, 3) [rad]."""
         return self.kick.reference.window(0, STEPS)[1]
 
 
 def row(axis: str, value: Any, promise: str, seen: str, held: bool) -> Row:
-    """One case."""
+    """Return the row of one case."""
     return {"axis": axis, "value": str(value), "promise": promise, "seen": seen, "held": bool(held)}
 
 
 def fastest(states: np.ndarray) -> float:
-    """The greatest speed along an axis [m/s] in states (*, L, 13)."""
+    """Return the greatest speed along an axis [m/s] in states (*, L, 13)."""
     return float(np.abs(np.asarray(states, float)[..., packed.VELOCITY]).max(initial=0.0))
 
 
 def sound(states: np.ndarray) -> np.ndarray:
-    """The steps of a trajectory (H, L, 13) before it is flagged as diverged: before it holds NaN alone."""
+    """Return the steps of a trajectory (H, L, 13) before it is flagged as diverged by a step of NaN alone."""
     flagged = np.isnan(states).all(axis=(1, 2))
     return states[: int(flagged.argmax()) if flagged.any() else len(states)]
 
 
 def bounded(axis: str, value: Any, states: np.ndarray) -> Row:
-    """Whether a trajectory (H, L, 13) stays finite, slow enough and rotated by rotations, until it is flagged."""
+    """Check that a trajectory (H, L, 13) stays finite, with bounded speeds and unit quaternions, until flagged."""
     kept = np.asarray(sound(states), float)
     speed = fastest(kept)
     unit = float(np.abs(np.linalg.norm(kept[..., packed.ORIENTATION], axis=-1) - 1.0).max(initial=0.0))
@@ -89,7 +89,7 @@ def bounded(axis: str, value: Any, states: np.ndarray) -> Row:
 
 
 def flagged(axis: str, value: Any, states: np.ndarray, flag: bool) -> Row:
-    """Whether the engine says so where a trajectory (H, L, 13) is not finite."""
+    """Check that the engine flags a trajectory (H, L, 13) that is not finite."""
     whole = bool(np.isfinite(states).all())
     seen = "finite, not flagged" if whole and flag else "flagged" if not flag else "not finite and not flagged"
     return row(axis, value, "MuJoCo: finite, or flagged as diverged", seen, whole or not flag)
@@ -99,7 +99,7 @@ def flagged(axis: str, value: Any, states: np.ndarray, flag: bool) -> Row:
 
 
 def scaled(scene: Scene, body: str, field: str, factor: float) -> Scene:
-    """The scene with one size of all links of a body times a factor; motors and surfaces stay."""
+    """Return the scene with one size of all links of a body times a factor; motors and surfaces stay."""
 
     def resized(each: Any) -> Any:
         if each.name != body:
@@ -112,7 +112,7 @@ def scaled(scene: Scene, body: str, field: str, factor: float) -> Scene:
 
 
 def standing(scene: Scene, state: np.ndarray) -> np.ndarray:
-    """A state (L, 13) with its joints closed for this scene, the human's lowest link and the ball on the ground."""
+    """Return a state (L, 13) with joints closed for this scene, the human's lowest link and the ball on the ground."""
     state = state.copy()
     radius = scene.links[-1].radius
     state[-1, 0] += max(radius - 0.11, 0.0)
@@ -128,7 +128,7 @@ def standing(scene: Scene, state: np.ndarray) -> np.ndarray:
 
 
 def sizes(bench: Bench, body: str, field: str) -> list[Row]:
-    """One size of the human or the ball, from a tenth to ten times its own."""
+    """Return rows of one size of the human or the ball, from a tenth to ten times its own."""
     scene, rows = bench.kick.scene, bench.kick.scene.rows(body)
     scenes = [scaled(scene, body, field, factor) for factor in FACTORS]
     starts = np.stack([standing(each, bench.kick.start()) for each in scenes])
@@ -167,7 +167,7 @@ Law = Callable[[np.ndarray, np.ndarray], tuple[str, str, bool]]
 
 
 class Case(NamedTuple):
-    """A start (L, 13) with targets (48, J, 3) [rad] and torques on all links (3,) [N m], and what it must keep."""
+    """A start (L, 13), targets (48, J, 3) [rad], a torque about y on each link [N m], and an optional law to check."""
 
     axis: str
     value: str
@@ -178,7 +178,7 @@ class Case(NamedTuple):
 
 
 def keeps_energy(scene: Scene) -> Law:
-    """The last body, a ball that touches only the ground, never has more energy than at the start."""
+    """Return the law that the last body, a ball that touches only the ground, gains no energy from its start on."""
     mass, radius = scene.links[-1].mass, scene.links[-1].radius
 
     def energy(states: np.ndarray) -> np.ndarray:
@@ -195,7 +195,7 @@ def keeps_energy(scene: Scene) -> Law:
 
 
 def cases(kick: Kick, controls: np.ndarray) -> list[Case]:
-    """Starts that no kick has, each with what is varied."""
+    """Return starts that do not occur in kicks, each with the quantity that is varied."""
     scene, base = kick.scene, kick.start()
     base[-1, :2] = 3.0, 0.0
     found: list[Case] = []
@@ -279,7 +279,7 @@ def _upside_down(state: np.ndarray) -> None:
 
 
 def wild_states(bench: Bench) -> list[Row]:
-    """All `cases`, in LARP and in MuJoCo."""
+    """Return rows of all `cases`, in LARP and in MuJoCo."""
     scene = bench.kick.scene
     every = cases(bench.kick, bench.controls)
     states = np.stack([case.state for case in every])
@@ -298,7 +298,10 @@ def wild_states(bench: Bench) -> list[Row]:
 
 
 def far_and_lost(bench: Bench) -> list[Row]:
-    """A ball very far away, and states that are not finite: neither may touch what it has no part in."""
+    """Return rows of a very distant ball and of broken states.
+
+    A distant ball must not affect the human, a broken state no other row of the batch.
+    """
     kick, human = bench.kick, bench.kick.human
     distances = (10.0, 1e3, 1e6, 1e12, 1e20, 1e30)
     base = kick.start().astype(np.float32)
@@ -337,7 +340,7 @@ def far_and_lost(bench: Bench) -> list[Row]:
 
 
 def offsets(bench: Bench) -> list[Row]:
-    """The kick, moved along the ground: the prediction moves with it, as far as the numbers are dense."""
+    """Return rows of a kick that is shifted along the ground: predictions must shift too, within precision."""
     found = []
     for bits, places in ((32, (10.0, 100.0, 1e3, 1e4)), (64, (1e4, 1e6))):
         with jax.enable_x64(bits == 64):
@@ -366,12 +369,12 @@ def offsets(bench: Bench) -> list[Row]:
 
 
 def in_double(model: Simulator) -> Simulator:
-    """The model with weights of 64 bits."""
+    """Return the model with weights of 64 bits."""
     return replace(model, weights=jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), model.weights))
 
 
 def precision(bench: Bench) -> list[Row]:
-    """What comes in decides the precision; what is too coarse is refused."""
+    """Return rows of precision: inputs decide it, and types of too low precision are refused."""
     found = []
     start, controls = bench.kick.start()[None], bench.controls[None]
     single = np.asarray(jax.jit(bench.model.rollout)(start, controls))
@@ -410,7 +413,7 @@ def refusal(call: Callable[[], Any], words: str) -> tuple[str, bool]:
 
 
 def batches(bench: Bench) -> list[Row]:
-    """One step of 1 to 8192 states, each row as if it were alone."""
+    """Return rows of one step of 1 to 8192 states, each row compared with the same state alone."""
     found = []
     count = 8192
     random = np.random.default_rng(1)
@@ -430,7 +433,7 @@ def batches(bench: Bench) -> list[Row]:
 
 
 def horizons(bench: Bench) -> list[Row]:
-    """The kick and then the reference's last targets, for 20 000 steps (200 s)."""
+    """Return rows of the kick and then the reference's last targets, for up to 20 000 steps (200 s)."""
     kick, scene = bench.kick, bench.kick.scene
     length = 20_000
     controls = kick.reference.window(0, length)[1][None]
@@ -454,7 +457,7 @@ def horizons(bench: Bench) -> list[Row]:
 
 
 def geometry() -> list[Row]:
-    """Closest points, their reverse and forward gradients, and impacts, where capsules are degenerate."""
+    """Return rows of distances of degenerate capsules, with their reverse and forward gradients."""
     x, y, zero = np.array([0.3, 0.0, 0.0]), np.array([0.0, 0.3, 0.0]), np.zeros(3)
     pairs = {
         "centres coincide": (zero, x, zero, y, -0.15),
@@ -500,7 +503,10 @@ def geometry() -> list[Row]:
 
 
 def drawn(kind: str, random: np.random.Generator | None) -> Scene:
-    """A scene of a kind, its sizes drawn from a tenth to ten times the usual; the usual ones without a generator."""
+    """Return a scene of a kind with sizes from a tenth to ten times the usual, or the usual without a generator.
+
+    A human's height [m] is between 0.3 and 3, and so are the factors of its segments' lengths and radii.
+    """
 
     def size(usual: float) -> float:
         return usual if random is None else float(usual * 10.0 ** random.uniform(-1.0, 1.0))
@@ -538,7 +544,10 @@ def drawn(kind: str, random: np.random.Generator | None) -> Scene:
 
 
 def wild(scene: Scene, count: int, random: np.random.Generator) -> np.ndarray:
-    """States (count, L, 13): any turn, speeds to 50 m/s, spins to 200 rad/s, below ground, some all in one place."""
+    """Return states (count, L, 13) of random orientations, speeds to 50 m/s and angular velocities to 200 rad/s.
+
+    Links may be below ground, and in some states all are in one place.
+    """
     states = np.zeros((count, len(scene.links), packed.SIZE))
     spread = 10.0 ** random.uniform(-3.0, 0.5, (count, 1, 1))
     states[..., packed.POSITION] = spread * random.standard_normal((count, len(scene.links), 3)) + (0.0, 0.0, 0.5)
@@ -553,18 +562,18 @@ def wild(scene: Scene, count: int, random: np.random.Generator) -> np.ndarray:
 
 
 class Tally(NamedTuple):
-    """Random scenes of a kind: how many states were tried, and what went wrong."""
+    """Counts of states tried and of failures, in random scenes of a kind."""
 
     tried: int
     crashes: list[str]
     larp_lost: int  # not finite, and costs infinity
     truth_lost: int  # flagged as diverged
-    silent: int  # not finite, and nothing says so
+    silent: int  # not finite, but not flagged
     slowest: float  # s, of a scene in the engine
 
 
 def random_scenes(kind: str, model: Simulator, scenes: int, each: int, steps: int, seed: int) -> Tally:
-    """Random sizes and states of one kind of scene, in MuJoCo and in the learned simulator."""
+    """Roll out random sizes and states of one kind of scene, in MuJoCo and in the learned simulator."""
     random = np.random.default_rng((seed, KINDS.index(kind)))
     crashes: list[str] = []
     truth_lost = silent = 0
@@ -606,7 +615,7 @@ def random_scenes(kind: str, model: Simulator, scenes: int, each: int, steps: in
 
 
 def scene_rows(kind: str, model: Simulator, scenes: int, each: int, seed: int) -> list[Row]:
-    """The promises of random scenes of a kind."""
+    """Return rows of random scenes of a kind: no crash, no slow scene, no unflagged divergence."""
     found = random_scenes(kind, model, scenes, each, 10, seed)
     value = f"{kind}, {found.tried} states"
     crashed = f"{len(found.crashes)} crashes" + (f", the first: {found.crashes[0][:80]}" if found.crashes else "")

@@ -1,4 +1,4 @@
-"""How a person kicks: the joint angles of the embedded kick beside those of captured kicks."""
+"""Comparison of the embedded kick with captured kicks: joint angles and toe speed around the strike."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tasks.command import run
 from tasks.motions import bvh, skeleton
 from tasks.motions.references import Reference, embedded
 
-# The part of a kick that is looked at, around its strike [s].
+# Time before and after the strike that is compared [s].
 BEFORE, AFTER = 0.6, 0.4
 # Joints whose flexion is compared: title, link, and the sign that makes flexion positive (the ankle's is plantar).
 CURVES = (
@@ -56,11 +56,14 @@ class ReferenceKick:
 
     @property
     def kind(self) -> str:
-        """What the toe's speed says it is."""
+        """Return "kick" if the toe reaches the speed of the slowest kick, else "walk"."""
         return "kick" if self.toe.max() >= skeleton.SLOWEST_KICK else "walk"
 
     def figures(self) -> dict[str, float]:
-        """What the table shows. Backswing: the hip's least flexion and the knee's greatest until the strike."""
+        """Return the figures of the table by column.
+
+        Backswing: least hip flexion and greatest knee flexion until the strike.
+        """
         swing, strike = self.time <= 0.0, int(abs(self.time).argmin())
         hip, knee, ankle, plant = (self.flexion[title] for title, _, _ in CURVES)
         values = (self.toe.max(), hip[swing].min(), knee[swing].max(), hip[strike], knee[strike], ankle[strike])
@@ -68,7 +71,7 @@ class ReferenceKick:
 
 
 def _kick(name: str, body: Body, angles: np.ndarray, toe: np.ndarray, strike: int, dt: float) -> ReferenceKick:
-    """The kick of joint rotation vectors (T, J, 3) [rad] and toe speeds (T,) [m/s], `dt` [s] apart."""
+    """Return the kick of joint rotation vectors (T, J, 3) [rad] and toe speeds (T,) [m/s], `dt` [s] apart."""
     joints = [body.links[child].name for child, _, _ in body.motors]
     time = (np.arange(len(toe)) - strike) * dt
     shown = (time >= -BEFORE) & (time <= AFTER)
@@ -77,7 +80,7 @@ def _kick(name: str, body: Body, angles: np.ndarray, toe: np.ndarray, strike: in
 
 
 def performed(name: str, scene: Scene, reference: Reference) -> ReferenceKick:
-    """A reference's kick, from its states in the truth; the toe is the front end of the foot's axis."""
+    """Return a reference's kick from its ground-truth states; the toe is the front end of the foot's axis."""
     human = scene.bodies[0]
     states = reference.states[:, scene.rows(human.name)]
     turns = [
@@ -92,7 +95,10 @@ def performed(name: str, scene: Scene, reference: Reference) -> ReferenceKick:
 
 
 def recorded(path: Path, scene: Scene) -> ReferenceKick:
-    """The fastest swing of a captured clip, as it was recorded; the toe is the toes' base. Left feet are mirrored."""
+    """Return the fastest swing of a captured clip; the toe is the base of the toes.
+
+    Kicks by the left foot are mirrored.
+    """
     motion = bvh.load(path)
     if skeleton.kicking_side(motion) == "Left":
         motion = skeleton.mirrored(motion)
@@ -106,7 +112,7 @@ def recorded(path: Path, scene: Scene) -> ReferenceKick:
 
 
 def table(kicks: list[ReferenceKick]) -> Table:
-    """A row a kick, the embedded one first, and the range of the captured kicks."""
+    """Return a table with one row per kick, the embedded one first, and the range over the captured kicks."""
     rows = Table("kick", "kind", *COLUMNS.values(), title="Flexions at the strike and in the backswing [deg]")
 
     def text(column: str, value: float) -> str:
@@ -122,7 +128,7 @@ def table(kicks: list[ReferenceKick]) -> Table:
 
 
 def picture(kicks: list[ReferenceKick]) -> Figure:
-    """Flexions and toe speed over the time from the strike; walks dashed."""
+    """Plot flexions and toe speed over the time from the strike; walks are dashed."""
     figure = Figure(figsize=(14, 8), layout="constrained")
     figure.suptitle("The embedded kick and captured ones", fontsize=16)
     panels = figure.subplots(2, 3).ravel()

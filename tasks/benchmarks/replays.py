@@ -1,4 +1,4 @@
-"""Executed kicks, replayed open loop: how far an engine goes astray from MuJoCo's own limit of small steps."""
+"""Open-loop replays of executed kicks: errors of engines against MuJoCo with small, converged steps."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from tasks.gap import LAUNCH_STEPS, contact_step
 from tasks.kick import Kick
 from tasks.task import LINGER, Planners
 
-# MuJoCo's limit: the engine steps in a step against which all others are judged.
+# MuJoCo's limit: engine steps in a step at which it is the reference for all others.
 LIMIT = 160
-# After the reference's strike, so many steps bring the ball past its target.
+# Steps after the reference's strike within which the ball passes its target.
 AFTER_STRIKE = 150
-# A launch is replayed from so many steps before contact.
+# Steps before contact from which a launch is replayed.
 BEFORE_CONTACT = 3
 
 # States (1, L, 13) and joint targets (1, H, J, 3) [rad] -> position and velocity (H, 6) [m, m/s] of the ball.
@@ -40,7 +40,7 @@ class Kicked(NamedTuple):
 
 
 def player_of(scene: Scene, engine: str, substeps: int) -> Player:
-    """An engine's replay of one kick."""
+    """Return a function that replays one kick in an engine."""
     if engine in STEPPED:
         truth = STEPPED[engine](scene, substeps, 1)
 
@@ -65,13 +65,13 @@ def player_of(scene: Scene, engine: str, substeps: int) -> Player:
 
 
 def ball_of(states: np.ndarray) -> np.ndarray:
-    """Position and velocity (H, 6) [m, m/s] of the last link in states (H, L, 13)."""
+    """Return position and velocity (H, 6) [m, m/s] of the last link in states (H, L, 13)."""
     ball = states[:, -1]
     return np.concatenate([ball[:, packed.POSITION], ball[:, packed.VELOCITY]], axis=-1)
 
 
 def executed(kick: Kick, planners: Planners, target: np.ndarray, seed: int, shift: np.ndarray) -> Kicked:
-    """A kick, planned and executed in the truth until the ball is away; then the reference's joint targets follow."""
+    """Plan a kick and execute it in the ground truth until the ball is away; the reference's joint targets follow."""
     until = kick.reference.strike + LINGER
     execution = kick.run(planners, target, seed, kick.start(shift), steps=until)
     _, after = kick.reference.window(until, AFTER_STRIKE - LINGER)
@@ -79,9 +79,10 @@ def executed(kick: Kick, planners: Planners, target: np.ndarray, seed: int, shif
 
 
 def astray(scene: Scene, kicked: Kicked, players: dict[Engine, Player]) -> list[report.Row]:
-    """How far each engine is from MuJoCo's limit; nothing where the limit misses the ball.
+    """Return each engine's errors against MuJoCo's limit; no rows where the limit has no contact with the ball.
 
-    error_m: between the balls when the limit's passes nearest to the target, replayed from the kick's start.
+    Contact must come at least `BEFORE_CONTACT` steps after the start.
+    error_m: distance of the balls when the limit's passes nearest to the target, replayed from the kick's start.
     launch_error: |v - v'| / |v|, `LAUNCH_STEPS` after contact, replayed from `BEFORE_CONTACT` steps before it.
     """
     start, controls = kicked.start[None], kicked.controls[None]
@@ -109,7 +110,7 @@ def astray(scene: Scene, kicked: Kicked, players: dict[Engine, Player]) -> list[
 
 
 def summarise(kicks: Iterable[list[report.Row]]) -> list[report.Row]:
-    """Each engine's errors over all kicks; None for what is not finite.
+    """Return each engine's errors over all kicks; None for what is not finite.
 
     A kick in which an engine diverged is left out of its mean, and counts as infinitely far off in its medians.
     """

@@ -1,4 +1,4 @@
-"""What every benchmark does: keep finished rows, name the hardware, write its JSON, its picture and its results."""
+"""Shared output of the benchmarks: resumable rows, hardware name, JSON, picture and tables in RESULTS.md."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ Row = dict[str, Any]
 
 
 def ready(path: Path, publish: bool, weights: Path | None = None) -> None:
-    """Refuse, before anything is computed, a JSON that could not be written or results that have no place.
+    """Raise InputError, before anything is computed, if the JSON cannot be written or results cannot be published.
 
-    Only what ships is published: no weights, and code that is committed.
+    Results are published only from committed code and without weights.
     """
     require_writable(path.parent, "json")
     if not publish:
@@ -48,10 +48,10 @@ def ready(path: Path, publish: bool, weights: Path | None = None) -> None:
 
 
 def collect(path: Path, command: str, jobs: Mapping[str, Callable[[], Row]]) -> list[Row]:
-    """The row of every job, by name; each is kept beside the JSON `path` as soon as it is done.
+    """Run all jobs and return their rows; each row is saved beside the JSON `path` as soon as it is done.
 
-    A run that was cut off goes on where it was, if command, hardware, code and weights are the same. Says how long it
-    has still to go.
+    An interrupted run resumes from the saved rows if command, hardware, code and weights are the same. Prints the
+    estimated time left.
     """
     made_by = {"command": command, "hardware": hardware(), "version": version()}
     kept = _partial(path)
@@ -76,7 +76,7 @@ def _partial(path: Path) -> Path:
 
 
 def _rows_of(kept: Path, made_by: Mapping[str, str]) -> dict[str, Row]:
-    """Rows that a run of the same kind left behind; none where there was no such run."""
+    """Return the rows by name that a run of the same kind saved; none where there was no such run."""
     try:
         found = json.loads(kept.read_text())
         return dict(found["rows"]) if found["made_by"] == made_by else {}
@@ -90,7 +90,7 @@ def _duration(seconds: float) -> str:
 
 
 def _git(*arguments: str) -> str:
-    """Return what git says of this project."""
+    """Return the output of a git command in this project."""
     try:
         found = subprocess.run(["git", *arguments], cwd=PROJECT, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError) as error:
@@ -99,7 +99,7 @@ def _git(*arguments: str) -> str:
 
 
 def version() -> str:
-    """A digest of what a figure depends on: the code and the weights, other benchmarks included."""
+    """Return a digest of all code and weights that a figure can depend on, other benchmarks included."""
     digest = hashlib.sha256()
     for package in PACKAGES:
         for file in sorted((PROJECT / package).rglob("*")):
@@ -110,7 +110,7 @@ def version() -> str:
 
 
 def hardware() -> str:
-    """The machine a figure was measured on."""
+    """Return the machine that figures are measured on: processor, cores, accelerator and version of JAX."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
@@ -122,7 +122,7 @@ def hardware() -> str:
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write a benchmark's JSON, whole or not at all; the rows kept on the way are no longer needed."""
+    """Write a benchmark's JSON, whole or not at all, and delete the rows saved on the way."""
     write_whole(path, (json.dumps(content, indent=2) + "\n").encode())
     _partial(path).unlink(missing_ok=True)
 
@@ -155,7 +155,7 @@ def publish(name: str, title: str, command: str, *tables: Table) -> None:
 
 
 def markdown(table: Table) -> str:
-    """A rich table as markdown."""
+    """Return a rich table as markdown."""
     columns = [list(column.cells) for column in table.columns]
     header = [str(column.header) for column in table.columns]
     rows = [header, ["---"] * len(header), *zip(*columns, strict=True)]

@@ -1,4 +1,4 @@
-"""Gradients: reverse, forward and central differences of a step, and how the reverse gradient of a kick grows."""
+"""Checks of gradients: reverse, forward and central differences of a step, and growth of a kick's gradient."""
 
 from __future__ import annotations
 
@@ -23,13 +23,16 @@ from tasks.task import KNOTS, SEARCH
 # a state whose kink lies within it is tried again with the next.
 DIFFERENCES = (1e-7, 1e-8, 1e-9, 1e-10)
 AGREE = 0.01
-# Cost per spread; a kick costs some tens, so that a true slope beyond this says nothing of a spread away.
+# Cost per spread; a kick costs some tens, so that a true slope beyond this predicts nothing one spread away.
 USEFUL = 1e3
 TARGET = np.array([4.0, 0.0, 0.5])
 
 
 def around_contact(bench: Bench, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """States (count, L, 13) and targets (count, J, 3) [rad] of random episodes, the first half near first contacts."""
+    """Return states (count, L, 13) and targets (count, J, 3) [rad] of random episodes.
+
+    The first half is near first contacts.
+    """
     random = np.random.default_rng(seed)
     episodes, _ = random_episodes(bench.kick.scene, bench.kick.reference, max(count // 4, 16), seed + 3)
     contacts = first_contacts(bench.kick.scene, episodes)
@@ -44,10 +47,10 @@ def around_contact(bench: Bench, count: int, seed: int) -> tuple[np.ndarray, np.
 
 
 def step_gradients(bench: Bench, states: np.ndarray, controls: np.ndarray, seed: int) -> dict[str, np.ndarray]:
-    """Relative errors (N,) of one step's gradients in float64, along a random direction of state and targets each.
+    """Return relative errors of one step's gradients in float64, along a random direction of state and targets each.
 
-    reverse: of the pairing with a random vector, against forward. differences: of the vector, |central - forward| /
-    |forward|, by the width of the difference, one row each (4, N).
+    reverse (N,): of the product with a random vector, against forward. differences (4, N): of the vector,
+    |central - forward| / |forward|, one row per width of the difference.
     """
     random = np.random.default_rng(seed)
     along = random.standard_normal(states.shape), random.standard_normal(controls.shape)
@@ -74,7 +77,7 @@ def step_gradients(bench: Bench, states: np.ndarray, controls: np.ndarray, seed:
 
 
 def of_steps(bench: Bench, count: int, seed: int) -> list[Row]:
-    """Reverse = forward = central differences on random states."""
+    """Return rows that compare reverse, forward and central differences of a step on random states."""
     states, controls = around_contact(bench, count, seed)
     found = step_gradients(bench, states, controls, seed)
     reverse, differences = found["reverse"], found["differences"]
@@ -101,7 +104,7 @@ def of_steps(bench: Bench, count: int, seed: int) -> list[Row]:
 
 
 def ball_slopes(bench: Bench) -> list[Row]:
-    """What a small change of the ball's height does within a step: where the growth comes from."""
+    """Return rows of a step's derivative by the ball's height, the source of the growth of gradients."""
     ball, radius = bench.kick.scene.bodies[-1].name, bench.kick.scene.links[-1].radius
     model = Simulator.of(bench.model.model.on(bench.kick.scene.only(ball)), bench.model.weights)
     slope = jax.jit(jax.vmap(jax.jacfwd(lambda s: model.step(s[None], jnp.zeros((1, 0, 3)))[0, 0])))
@@ -124,7 +127,7 @@ def ball_slopes(bench: Bench) -> list[Row]:
 
 
 def candidates(kick: Kick, count: int, seed: int) -> np.ndarray:
-    """Knots (count, K, J, 3) [rad] as the planner draws them around the reference."""
+    """Return knots (count, K, J, 3) [rad] as the planner draws them around the reference."""
     scale = SEARCH * stray(kick.scene)
     return coloured_noise(np.random.default_rng(seed), (count, KNOTS, *scale.shape), CEM.exponent) * scale
 
@@ -148,13 +151,16 @@ class Slope:
         self._gradient = jax.jit(jax.value_and_grad(summed, has_aux=True))
 
     def __call__(self, knots: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
-        """Costs (N,) and gradients (N, K, J, 3), per spread, of knots (N, K, J, 3) [rad]; steps: of the scene."""
+        """Return costs (N,) and gradients (N, K, J, 3), per spread, of knots (N, K, J, 3) [rad].
+
+        steps: of the scene.
+        """
         (_, costs), gradient = self._gradient(jnp.asarray(knots, jnp.float32), jnp.asarray(steps))
         return np.asarray(costs), np.asarray(gradient) * self.scale
 
 
 def update_of(gradient: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """The step (N, K, J, 3), per spread, that the planner takes down a gradient (N, K, J, 3), per spread."""
+    """Return the step (N, K, J, 3), per spread, that the planner takes down a gradient (N, K, J, 3), per spread."""
     scale = np.asarray(scale, np.float32)
     raw = np.divide(gradient, scale, where=scale > 0, out=np.zeros_like(gradient))
     moved, _, _ = Gradient().update(scale, raw, np.zeros_like(raw), 0)
@@ -162,7 +168,10 @@ def update_of(gradient: np.ndarray, scale: np.ndarray) -> np.ndarray:
 
 
 def of_kicks(bench: Bench, whole: Dynamics, count: int, seed: int) -> list[Row]:
-    """The reverse gradient of a kick of 48 steps and 120 of flight, in float32: its size by the steps it goes back."""
+    """Return rows of a kick's reverse gradient in float32: its norm by the number of steps it goes back.
+
+    The kick has 48 steps, and 120 of flight.
+    """
     knots = candidates(bench.kick, count, seed)
     rows = []
     for name, model, lengths in (

@@ -1,4 +1,4 @@
-"""What a simulated step costs, engine by engine; and how exact a kick is for that price.
+"""Cost of a simulated step in each engine, and accuracy of replayed kicks at that cost.
 
 Each row is measured in a process of its own: time, compilation and peak memory of one engine with one scene and batch.
 Each kick is planned and executed in MuJoCo once and then replayed open loop by every engine.
@@ -35,7 +35,7 @@ from tasks.presets import preset_of
 
 # Engine steps in a step, by engine; all of Brax's pipelines have the same.
 SUBSTEPS = {"larp": (1,), "mujoco": (2, 4, 5, 10, 20, 40), "mjx": (20,), "brax": (20,), "bullet": (20,)}
-# Those with which kicks are replayed too, beside the above.
+# Further engine steps, with which kicks are replayed beside the above.
 MORE = {"mujoco": (80,), "bullet": (5,)}
 CASES = {
     "ball": (("ball", None),),
@@ -43,13 +43,13 @@ CASES = {
     "human_ball": (("human_ball", "far"), ("human_ball", "struck")),
 }
 DIFFERENTIABLE = ("larp", "mjx", "brax")
-# Engines that step one simulation after another, so that a larger batch tells nothing more.
+# Engines that step one simulation after another, so that a larger batch adds no information.
 ALONE = ("bullet",)
-# Gradients are asked for up to this batch, accuracy beside the time at it, and memory is shown at it.
+# Largest batch of gradients; the batch whose time is shown beside accuracy, and at which memory is shown.
 MIDDLE = 512
-# A row's process is ended after so many seconds, later for a gradient, which compiles for long.
+# Time limit of a row's process [s] by whether it takes a gradient, which compiles for long.
 SECONDS = {False: 120.0, True: 300.0}
-# Where a step takes so many seconds, larger batches are not asked for.
+# Larger batches are skipped where a step takes longer than this [s].
 SLOW = 0.5
 PRESET = "fast"
 STYLES = {"spring": "--", "positional": ":"}
@@ -57,7 +57,7 @@ COLOURS = {"larp": "#d55e00", "mujoco": "#0072b2", "mjx": "#009e73", "brax": "#c
 
 
 def listed(name: str, text: str, known: tuple[str, ...]) -> list[str]:
-    """The words between the commas; refuses what is not known."""
+    """Return the words between commas; raise InputError for one that is not known."""
     words = [word.strip() for word in text.split(",")]
     if odd := [word for word in words if word not in known]:
         raise InputError(f"{name} has {odd[0]!r}, but can have {', '.join(known)}, with commas between them")
@@ -65,7 +65,7 @@ def listed(name: str, text: str, known: tuple[str, ...]) -> list[str]:
 
 
 def batches(text: str) -> list[int]:
-    """Batch sizes between commas, smallest first."""
+    """Return the batch sizes between commas, smallest first; raise InputError unless they are positive integers."""
     words = text.split(",")
     if not all(word.strip().isdecimal() and int(word) > 0 for word in words):
         raise InputError(f"batch is {text!r}, but must be integers of at least 1, with commas between them")
@@ -73,38 +73,38 @@ def batches(text: str) -> list[int]:
 
 
 def variants(engine: str) -> list[str]:
-    """The engine by its pipelines, if it has any."""
+    """Return the engine's pipelines where it has some (Brax), else the engine itself."""
     return [f"brax {pipeline}" for pipeline in PIPELINES] if engine == "brax" else [engine]
 
 
 def questions(scenes: list[str], engines: list[str], sizes: list[int], seed: int) -> Iterator[Question]:
-    """All rows; of one engine in one case the smaller batch comes first."""
+    """Yield the questions of all rows; of one engine in one case the smaller batch comes first."""
     cases = [each for scene in scenes for each in CASES[scene]]
     for engine in engines:
         for name, (scene, reach), substeps in product(variants(engine), cases, SUBSTEPS[engine]):
             for size in sizes if engine not in ALONE else (1,):
                 yield Question(name, scene, reach, substeps, size, seed=seed)
-    # Gradients compile for long, and planners take those of the learned simulator in their own scene: for all else,
-    # one batch tells.
+    # Gradients compile for long, and planners use those of the learned simulator in their own scene: for all else,
+    # one batch suffices.
     few = [size for size in sizes if size <= MIDDLE]
     for engine in (engine for engine in engines if engine in DIFFERENTIABLE):
-        # Of the others, Brax takes no other scene and MJX refuses in all of them.
+        # Of the others, Brax supports no other scene and MJX fails in all of them.
         for name, (scene, reach) in product(variants(engine), cases if engine == "larp" else cases[:1]):
             for size in few if engine == "larp" and reach == "struck" else few[-1:]:
                 yield Question(name, scene, reach, SUBSTEPS[engine][-1], size, gradient=True, seed=seed)
 
 
 class Asking:
-    """Asks each question in a process of its own.
+    """Runner of questions, each in a process of its own.
 
-    What an engine refused or is slow at, it is not asked again with a larger batch.
+    Where an engine refused or was slow, later questions that differ only in the batch are not run.
     """
 
     def __init__(self) -> None:
         self.refused: dict[Question, str] = {}
 
     def __call__(self, question: Question) -> report.Row:
-        """The row of a question: see `engines.answer`."""
+        """Return the row of a question; see `engines.answer`."""
         row, same = asdict(question) | {"coarse": question.coarse}, replace(question, batch=0)
         row |= {"refused": self.refused[same]} if same in self.refused else self.asked(question)
         if row["refused"] is not None:
@@ -114,7 +114,7 @@ class Asking:
         return row
 
     def asked(self, question: Question) -> report.Row:
-        """What the process says, or what became of it."""
+        """Return the result of a question's process, or in `refused` the reason why there is none."""
         command = [sys.executable, "-m", "tasks.benchmarks.engines", codec.dumps(asdict(question))]
         most = SECONDS[question.gradient]
         try:
@@ -128,7 +128,10 @@ class Asking:
 
 
 def replayed_by(engines: list[str]) -> list[replays.Engine]:
-    """The engines in which kicks are replayed, with their engine steps; Brax takes no human, MJX is MuJoCo again."""
+    """Return the engines that replay kicks, with their engine steps.
+
+    Brax is left out because it supports no human, MJX because it is MuJoCo again.
+    """
     return [
         (engine, substeps)
         for engine in engines
@@ -138,12 +141,12 @@ def replayed_by(engines: list[str]) -> list[replays.Engine]:
 
 
 def price(engine: str, substeps: int, seed: int) -> Question:
-    """What a replay costs: a struck ball, at the middle batch where the engine has batches."""
+    """Return the question whose time is a replay's cost: a struck ball, at the middle batch (1 for `ALONE`)."""
     return Question(engine, "human_ball", "struck", substeps, 1 if engine in ALONE else MIDDLE, seed=seed)
 
 
 def kicks_of(engines: list[replays.Engine], count: int, seed: int) -> dict[str, partial[report.Row]]:
-    """The jobs of executed and replayed kicks, by name."""
+    """Return the jobs that execute and replay kicks, by name."""
     kick = Kick.standard()
     planners = kick.planners_of(preset_of(PRESET), models_of(kick.scene, "larp"))
     random = np.random.default_rng(seed)
@@ -152,7 +155,7 @@ def kicks_of(engines: list[replays.Engine], count: int, seed: int) -> dict[str, 
     def players() -> dict[replays.Engine, replays.Player]:
         found = {}
         for engine, substeps in engines:
-            with suppress(Exception):  # its row of the speed says why
+            with suppress(Exception):  # its row of the speed table gives the reason
                 found[engine, substeps] = replays.player_of(kick.scene, engine, substeps)
         return found
 
@@ -164,12 +167,12 @@ def kicks_of(engines: list[replays.Engine], count: int, seed: int) -> dict[str, 
 
 
 def label(row: report.Row) -> str:
-    """An engine with its engine steps, as tables show it."""
+    """Return a row's engine with its engine steps, as tables show it."""
     return titled(row["engine"], row["substeps"])
 
 
 def speed_table(rows: list[report.Row], sizes: list[int]) -> Table:
-    """Microseconds per scene and step by batch; compilation and memory at the middle batch."""
+    """Return a table of microseconds per scene and step by batch, with compilation and memory at the middle batch."""
     table = Table("engine", "scene", *(f"{size}" for size in sizes), "compiled in", "memory", "launch error")
     table.title = "Microseconds per scene and step of 10 ms, by batch"
     groups: dict[tuple[str, str, bool], list[report.Row]] = {}
@@ -203,7 +206,7 @@ def speed_table(rows: list[report.Row], sizes: list[int]) -> Table:
 
 
 def accuracy_table(found: list[report.Row]) -> Table:
-    """Errors of replayed kicks beside the price."""
+    """Return a table of the errors of replayed kicks beside the time per scene and step."""
     table = Table("engine", "mean", "median", "launch error, median", "diverged", f"us, batch {MIDDLE}")
     table.title = f"Ball's distance from MuJoCo's at {replays.LIMIT} engine steps, where it passes the target"
 
@@ -223,7 +226,7 @@ def accuracy_table(found: list[report.Row]) -> Table:
 
 
 def speed_picture(rows: list[report.Row]) -> Figure:
-    """Time per step over the number of simulations side by side, a panel a case."""
+    """Plot the time per step over the batch size, with one panel per case."""
     panels = list(dict.fromkeys((row["scene"], row["reach"]) for row in rows))
     timed = [
         row
@@ -254,7 +257,7 @@ Curve = dict[int, float]
 
 
 def curves(rows: list[report.Row]) -> dict[str, dict[int, Curve]]:
-    """Milliseconds per step by engine, engine steps and batch."""
+    """Return the milliseconds per step by engine, engine steps and batch."""
     found: dict[str, dict[int, Curve]] = {}
     for row in rows:
         found.setdefault(row["engine"], {}).setdefault(row["substeps"], {})[row["batch"]] = row["ms_per_step"]
@@ -262,7 +265,7 @@ def curves(rows: list[report.Row]) -> dict[str, dict[int, Curve]]:
 
 
 def draw(axes: Axes, engine: str, lines: dict[int, Curve]) -> tuple[str, Line2D]:
-    """An engine's line, with a band from its fewest to its most engine steps; returns its name and the line."""
+    """Draw an engine's line with a band from its fewest to its most engine steps; return its name and the line."""
     colour, style = COLOURS[engine.split()[0]], STYLES.get(engine.split()[-1], "-")
     substeps = CONVERGED if CONVERGED in lines else max(lines)
     name = NAMES[engine] if engine == "larp" else f"{NAMES[engine]}, {substeps} engine steps"
@@ -278,7 +281,7 @@ def draw(axes: Axes, engine: str, lines: dict[int, Curve]) -> tuple[str, Line2D]
 
 
 def accuracy_picture(found: list[report.Row]) -> Figure:
-    """Error over the time per scene and step; MuJoCo's points joined and named by their engine steps."""
+    """Plot the error over the time per scene and step; an engine's points are joined, and marked by engine steps."""
     figure = Figure(figsize=(7, 4.8), layout="constrained")
     axes = figure.subplots()
     priced = [row for row in found if None not in (row["us_per_scene_step"], row["mean_m"], row["median_m"])]

@@ -1,6 +1,6 @@
-"""Where it breaks: sizes, states, precision, horizons, gradients, planners and random scenes, pushed until they do.
+"""Stress tests of sizes, states, precision, horizons, gradients, planners and random scenes, up to failure.
 
-One row a case: what was pushed, what is promised, what was seen, and whether the promise held.
+Each case is a row: the quantity that is varied, its value, the promise, the observation, and whether the promise held.
 """
 
 from __future__ import annotations
@@ -39,7 +39,10 @@ SMALL = CEM(samples=8, rounds=2, elites=2)
 
 @dataclass(frozen=True)
 class Shaky:
-    """One link that moves by 100 u dt, and is lost where its target's first number is beyond `lost` [rad]."""
+    """Dynamics of one link that moves by `steepness` times its target in each step.
+
+    A candidate becomes NaN where the magnitude of a target's first number exceeds `lost` [rad].
+    """
 
     lost: float
     steepness: float = 1.0
@@ -47,7 +50,7 @@ class Shaky:
     differentiable = True
 
     def rollout(self, state: jax.Array, controls: jax.Array, steps: jax.Array | None = None) -> jax.Array:
-        """See `mpc.Dynamics.rollout`."""
+        """Return the states under controls; see `mpc.Dynamics.rollout`."""
         moved = self.steepness * jnp.cumsum(controls[:, :, 0], axis=1)
         states = jnp.repeat(state[:, None], controls.shape[1], axis=1).at[..., 0, :3].add(moved)
         gone = jnp.any(jnp.abs(controls[:, :, 0, 0]) > self.lost, axis=1)
@@ -55,20 +58,20 @@ class Shaky:
 
 
 def toy(dynamics: Any, optimizers: Any = SMALL, horizon: int = 6, knots: int = 2, spread: float = 0.1) -> Planner:
-    """A planner that wants one link at (0.3, 0, 0) m."""
+    """Return a planner that moves one link to (0.3, 0, 0) m."""
     reach = CostTerm("reach", lambda states, controls, context: states[-1, 0, :3] - jnp.array([0.3, 0.0, 0.0]))
     return Planner(dynamics, [reach], horizon, knots, 0.01, np.full((1, 3), spread), optimizers)
 
 
 def planned(planner: Planner, state: Any = None, reference: Any = None) -> tuple[Any, Any]:
-    """The plan and what was found out, from rest and from zero targets by default."""
+    """Return a first plan and its info, from the zero state and a zero reference by default."""
     state = np.zeros((1, 13)) if state is None else state
     reference = np.zeros((planner.horizon, 1, 3)) if reference is None else reference
     return planner.step(planner.init(jax.random.key(0)), state, reference)
 
 
 def small_planners() -> list[Row]:
-    """Planners of one link, where there is hardly anything to choose from or nothing comes back."""
+    """Return rows of one-link planners with few candidates, lost candidates, extreme slopes or refused arguments."""
     found = []
 
     def says(value: str, promise: str, planner: Planner, expected: Callable[[Any, Any], bool], **given: Any) -> None:
@@ -138,7 +141,7 @@ def small_planners() -> list[Row]:
 
 
 def targets(bench: Bench, whole: Any) -> list[Row]:
-    """Kick plans to targets where no ball can pass, and to some where it can."""
+    """Return rows of kick plans to targets, most of which no ball can reach."""
     kick = bench.kick
     planner = kick.planner(whole, (CEM(samples=16, rounds=2, elites=4),))
     plan = planner.init(jax.random.key(0))
@@ -171,21 +174,21 @@ def targets(bench: Bench, whole: Any) -> list[Row]:
 
 
 def execution(bench: Bench) -> list[Row]:
-    """Plans that are carried out in a world that does not stay finite."""
+    """Return rows of plans that are executed in a world whose states do not stay finite."""
     kick = bench.kick
     found = []
     still = toy(Shaky(np.inf))
 
     class Lost:
-        """A world of one link that is lost in its third step."""
+        """World of one link whose state becomes NaN in its third step."""
 
         count = 0
 
         def reset(self, states: np.ndarray) -> None:
-            """See `mpc.loop.World`."""
+            """Ignore the states; see `mpc.loop.World`."""
 
         def step(self, control: np.ndarray) -> np.ndarray:
-            """See `mpc.loop.World`."""
+            """Return a zero state, or NaN in the third step; see `mpc.loop.World`."""
             self.count += 1
             return np.full((1, 1, 13), np.nan if self.count == 3 else 0.0)
 
@@ -208,7 +211,7 @@ def execution(bench: Bench) -> list[Row]:
 
 
 def seen_by(jobs: dict[str, Callable[[], list[Row]]]) -> dict[str, Callable[[], Row]]:
-    """Jobs that give several rows each, as `report.collect` keeps them; one that crashes is a row that did not hold."""
+    """Wrap jobs of several rows each for `report.collect`; a job that crashes gives a row that did not hold."""
 
     def together(name: str, job: Callable[[], list[Row]]) -> Row:
         try:
@@ -224,7 +227,7 @@ def seen_by(jobs: dict[str, Callable[[], list[Row]]]) -> dict[str, Callable[[], 
 
 
 def picture(rows: list[Row], title: str) -> Figure:
-    """Every case a square, by what was pushed: blue where its promise held, orange where not."""
+    """Plot each case as a square, by the quantity varied: blue where its promise held, orange where not."""
     axes_names = list(dict.fromkeys(row["axis"] for row in rows))
     half = (len(axes_names) + 1) // 2
     figure = Figure(figsize=(13, 1.4 + 0.3 * half), layout="constrained")
@@ -233,7 +236,7 @@ def picture(rows: list[Row], title: str) -> Figure:
     for axes, names in zip(figure.subplots(1, 2), (axes_names[:half], axes_names[half:]), strict=True):
         for place, name in enumerate(names):
             held = [row["held"] for row in rows if row["axis"] == name]
-            # Those that held first, so that a glance tells their share.
+            # Cases that held come first, so that their share is visible.
             held.sort(reverse=True)
             axes.scatter(range(len(held)), [place] * len(held), c=[COLOURS[h] for h in held], marker="s", s=26)
         axes.set_yticks(range(len(names)), names)

@@ -1,4 +1,4 @@
-"""What a kick's accuracy costs: truth error against planning time, over everything that a preset can say."""
+"""Trade-off of a kick's accuracy and planning time, over a range of presets."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tasks.models import FLIGHT, models_of
 from tasks.presets import PRESETS, Preset
 from tasks.task import BEYOND
 
-# A preset moves where another point is so much better in both error and time.
+# Share by which another point must be better in both error and time to beat a preset.
 BETTER = 0.1
 FAMILIES = {
     "sampling": ("LARP, sampling", "o", "#0072b2"),
@@ -36,7 +36,7 @@ FAMILIES = {
 
 @dataclass(frozen=True)
 class Point:
-    """A way to plan: a preset, and the model in which it plans with its engine steps, where it is MuJoCo."""
+    """A planner's configuration: a preset, its dynamics, and the engine steps of these where they are MuJoCo."""
 
     preset: Preset
     dynamics: str = "larp"
@@ -44,7 +44,7 @@ class Point:
 
     @property
     def family(self) -> str:
-        """One of `FAMILIES`."""
+        """Return the key in `FAMILIES` that this point belongs to."""
         if self.dynamics == "mujoco":
             return "mujoco"
         if any(self.preset.verify):
@@ -54,7 +54,7 @@ class Point:
 
     @property
     def name(self) -> str:
-        """Model, optimisers of the first plan and of each replan, steps between replans, trials in the truth."""
+        """Return a name: model, optimisers of first plan and replans, steps between replans, ground-truth trials."""
         preset = self.preset
         model = "larp" if self.dynamics == "larp" else f"mujoco {self.substeps}"
         trials = ""
@@ -66,7 +66,10 @@ class Point:
 
 
 def _told(stage: Sequence[Optimizer]) -> str:
-    """Candidates x rounds of sampling, steps x elites of gradients; rounds, directions and step of Gauss-Newton."""
+    """Return the optimisers as text.
+
+    Sampling: samples x rounds. Gradients: elites x steps. Gauss-Newton: directions x rounds, and its derivatives.
+    """
 
     def one(each: Optimizer) -> str:
         match each:
@@ -87,12 +90,12 @@ def _told(stage: Sequence[Optimizer]) -> str:
 
 
 def cem(samples: int, rounds: int, elites: int) -> CEM:
-    """Rounds of one size, because every size is compiled apart."""
+    """Return a CEM whose rounds all have the same size, because every size is compiled separately."""
     return CEM(samples=samples, rounds=rounds, elites=elites, decay=1.0)
 
 
 def points() -> tuple[Point, ...]:
-    """What is measured: the presets, and what lies around them, each once."""
+    """Return the points to measure: the presets and variations around them, each once."""
     return tuple(dict.fromkeys((*map(Point, PRESETS.values()), *_around())))
 
 
@@ -126,7 +129,7 @@ def _around() -> Iterator[Point]:
     for rounds in (6, 12):
         forward = newton(rounds=rounds, jacobian="forward")
         yield larp(forward, again=newton(rounds=1, jacobian="forward"))
-    # More replans, and what they do.
+    # Steps between replans, and optimisers of replans.
     for every in (1, 2, 3, 8, 12):
         yield larp(newton(rounds=6), every=every)
     for again in (twice, newton(rounds=4), few):
@@ -135,7 +138,7 @@ def _around() -> Iterator[Point]:
     yield larp(cem(32, 4, 8), newton(rounds=4))
     yield larp(cem(32, 8, 8), newton(rounds=6))
     yield larp(Gradient(steps=16, elites=8), again=Gradient(steps=2, elites=8))
-    # Trials in the truth.
+    # Trials in the ground truth.
     for verify, enough in (((2, 1), 0.004), ((4, 1), 0.004), ((8, 1), 0.004), ((8, 3), 0.01), ((8, 3), 0.002)):
         yield larp(newton(rounds=6), verify=verify, enough=enough)
     yield larp(newton(rounds=6), verify=(8, 3), candidates=2)
@@ -151,7 +154,7 @@ def _around() -> Iterator[Point]:
 
 
 def measure(kick: Kick, point: Point, weights: Path | None, targets: int, seed: int) -> report.Row:
-    """Kicks to the first `targets` random targets of a seed, without the standing that follows them."""
+    """Measure kicks to the first `targets` random targets of a seed, without the standing phase after them."""
     models = models_of(kick.scene, point.dynamics, weights, substeps=point.substeps)  # type: ignore[arg-type]
     planners = kick.planners_of(point.preset, models)
     random, kicks = np.random.default_rng(seed), []
@@ -162,7 +165,7 @@ def measure(kick: Kick, point: Point, weights: Path | None, targets: int, seed: 
         plans = [replan.info for replan in kick.plans(execution)]
         spent = sum(info.seconds for info in plans)
         kicks.append(kick.report(execution, target) | {"planning_seconds": spent, "first_cost": plans[0].cost})
-    jax.clear_caches()  # the next point's programs are others, and each holds its memory
+    jax.clear_caches()  # the next point compiles other programs, and each occupies memory
     errors = np.array([each["truth_error_m"] for each in kicks])
     return {
         "point": point.name,
@@ -181,7 +184,7 @@ def measure(kick: Kick, point: Point, weights: Path | None, targets: int, seed: 
 
 
 def front(rows: Sequence[report.Row]) -> list[report.Row]:
-    """The rows that no other one beats in both mean error and planning time, the quickest first."""
+    """Return the Pareto front of mean error and planning time, the quickest row first."""
     best, found = np.inf, []
     for row in sorted(rows, key=lambda row: (row["planning_seconds"], row["mean_truth_error_m"])):
         if row["mean_truth_error_m"] < best:
@@ -191,13 +194,13 @@ def front(rows: Sequence[report.Row]) -> list[report.Row]:
 
 
 def beaten(row: report.Row, rows: Sequence[report.Row]) -> list[report.Row]:
-    """The rows that are better than this one by more than `BETTER` in both mean error and planning time."""
+    """Return the rows that are better than this one by more than `BETTER` in both mean error and planning time."""
     figures = ("planning_seconds", "mean_truth_error_m")
     return [other for other in rows if all(other[each] < (1.0 - BETTER) * row[each] for each in figures)]
 
 
 def picture(rows: Sequence[report.Row], presets: dict[str, str], targets: int) -> Figure:
-    """Every point, the front, and the presets, by name."""
+    """Plot every point, the Pareto front, and the presets by name."""
     figure = Figure(figsize=(9, 5.5), layout="constrained")
     axes = figure.subplots()
     best = front(rows)
@@ -233,7 +236,7 @@ def picture(rows: Sequence[report.Row], presets: dict[str, str], targets: int) -
 
 
 def table_of(rows: Sequence[report.Row], presets: dict[str, str]) -> Table:
-    """A row a point, the quickest first; what is on the front and which preset it is."""
+    """Return a table with one row per point, the quickest first; presets and points on the front are marked."""
     best = [row["point"] for row in front(rows)]
     table = Table(
         "point: first plan / replans", "error, mean +- standard error", "median", "planning", "first plan", "replan",
