@@ -22,7 +22,7 @@ class World(Protocol):
         """States (1, L, 13) after one step under joint targets (1, J, 3) [rad]; NaN where it diverged."""
 
 
-class Diverged(RuntimeError):
+class DivergenceError(RuntimeError):
     """The world's state is no longer finite: nothing that was executed from here on would mean anything."""
 
 
@@ -115,8 +115,8 @@ def execute(
 
     After the last phase its plan is carried out, and after the plan's end the task's reference. `observe` is called
     after every step. sense: what the planners are shown of a true state (L, 13); all of it by default. begun: to go
-    on with, from the state it has reached; the plans found are then those from there on. Raises `Diverged` as soon as
-    the world does.
+    on with, from the state it has reached; the plans found are then those from there on. Raises
+    `DivergenceError` as soon as the world diverges.
     """
     execution = Execution([np.asarray(state)])
     index, plan, planned_at, targets = 0, None, 0, np.zeros(0)
@@ -153,7 +153,7 @@ def execute(
         after = world.step(control[None])[0]
         if not np.isfinite(after).all():
             cause = "" if np.isfinite(control).all() else ": the joint targets are not finite"
-            raise Diverged(f"the world diverged in step {step}{cause}")
+            raise DivergenceError(f"the world diverged in step {step}{cause}")
         execution.states.append(after)
         observe(execution)
     return execution

@@ -23,7 +23,7 @@ from rich.table import Table
 
 from larp_model.errors import InputError
 from larp_model.runtime import remember_compilations, require_device
-from mpc.loop import Diverged
+from mpc.loop import DivergenceError
 
 # What a write fails with on a disk that takes no more.
 DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
@@ -45,7 +45,7 @@ def run(task: Callable[..., None] | dict[str, Callable[..., None]], arguments: l
                 tyro.cli(task, args=arguments)
         except InputError as error:
             _end(2, str(error))
-        except Diverged as error:
+        except DivergenceError as error:
             _end(1, str(error))
         except KeyboardInterrupt:
             _end(130, "interrupted")

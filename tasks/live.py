@@ -20,16 +20,16 @@ from larp_model import state as packed
 from larp_model.engines.mujoco import Truth
 from larp_model.errors import InputError
 from larp_model.scene import Scene
-from mpc.loop import Diverged, Execution, Replan, Window
+from mpc.loop import DivergenceError, Execution, Replan, Window
 from tasks.models import NO_WEIGHTS, DynamicsName, Models
 from tasks.presets import Preset
 from tasks.task import REACHABLE, Planners, Run, Task
 from viewer import (
     LivePage,
     Offer,
+    PageClosedError,
     Push,
     Recording,
-    Stopped,
     Wishes,
     kick_picture,
     nearest_approach,
@@ -162,7 +162,7 @@ class Live:
                     seen = self.page.changes
                     self.plan()
                 ask = self.page.asked(1.0 if seen == self.page.changes else 0.0)
-        except (Stopped, KeyboardInterrupt):
+        except (PageClosedError, KeyboardInterrupt):
             self.page.close()
 
     def plan(self) -> None:
@@ -217,7 +217,7 @@ class Live:
                     body = task.scene.bodies[-1 if ask.endswith("ball") else 0].name
                     world.waiting.append(self.page.push(body))
                 elif ask in ("reset", "kick"):
-                    raise Interrupted(ask)
+                    raise InterruptedKickError(ask)
 
         try:
             execution = task.run(
@@ -233,13 +233,13 @@ class Live:
             said = {name: getattr(wishes, name) for name in ("preset", "dynamics", "weights")} | {"seed": self.seed}
             self.run = Run(task, execution, goal, task.report(execution, goal) | said)
             self.recording = self.run.recording
-        except Interrupted as ended:
+        except InterruptedKickError as ended:
             if str(ended) == "kick":
                 self.page.ask("kick")
             else:
                 self.plan()
             return
-        except (Diverged, InputError) as error:
+        except (DivergenceError, InputError) as error:
             self.page.tell(f"**Ended:** {error}")
             return
         self.errors.append((self.run.truth_error_m, self.run.model_error_m))
@@ -354,7 +354,7 @@ def due(last: float, step: float) -> float:
     return max(last + step, time.monotonic() - step)
 
 
-class Interrupted(Exception):
+class InterruptedKickError(Exception):
     """The kick that runs was asked to end, by this name."""
 
 

@@ -16,7 +16,7 @@ from tasks.benchmarks import kick, report
 from tasks.presets import PRESETS, Preset
 
 
-class CutOff(Exception):
+class CutOffError(Exception):
     """What ends a run before its time."""
 
 
@@ -25,7 +25,7 @@ def jobs(done: list[int], until: int = 5) -> dict[str, partial[report.Row]]:
 
     def one(number: int) -> report.Row:
         if number == until:
-            raise CutOff
+            raise CutOffError
         done.append(number)
         return {"number": number}
 
@@ -35,7 +35,7 @@ def jobs(done: list[int], until: int = 5) -> dict[str, partial[report.Row]]:
 def test_a_run_that_was_cut_off_goes_on_where_it_was(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "some.json"
     done: list[int] = []
-    with pytest.raises(CutOff):
+    with pytest.raises(CutOffError):
         report.collect(path, "python -m some", jobs(done, until=3))
     assert done == [0, 1, 2] and not path.exists()
     rows = report.collect(path, "python -m some", jobs(done))

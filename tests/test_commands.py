@@ -22,7 +22,7 @@ from larp_model import commands, human
 from larp_model.errors import InputError
 from larp_model.files import write_whole, written_whole
 from larp_model.names import require_file
-from mpc.loop import Diverged
+from mpc.loop import DivergenceError
 from tasks.command import Stream, Teller, run
 from tasks.presets import preset_of
 from tasks.scenarios import scenario
@@ -71,7 +71,7 @@ def raising(error: BaseException) -> Callable[[], None]:
     ("error", "code", "line"),
     [
         (InputError("target is 1"), 2, "error: target is 1"),
-        (Diverged("the world diverged in step 3"), 1, "error: the world diverged in step 3"),
+        (DivergenceError("the world diverged in step 3"), 1, "error: the world diverged in step 3"),
         (KeyboardInterrupt(), 130, "error: interrupted"),
         (OSError(errno.ENOSPC, "No space left on device", "a.npz"), 1, "error: a.npz cannot be written: No space left"),
     ],

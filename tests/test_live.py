@@ -18,7 +18,7 @@ from larp_model.errors import InputError
 from tasks.kick import Kick, wished
 from tasks.live import ROLLS, SPOTS, TARGETS, Choices, Pushed, opened, weights_for
 from tasks.presets import PRESETS
-from viewer import LivePage, Push, Stopped
+from viewer import LivePage, PageClosedError, Push
 from viewer.camera import VIEWS, PictureCamera, View
 from viewer.handles import Handles
 from viewer.recording import known
@@ -75,7 +75,7 @@ def test_a_drag_is_a_change_and_what_is_asked_for_is_handed_on_in_order(page: Li
     page.ask("push ball")
     assert [page.asked(), page.asked(), page.asked()] == ["kick", "push ball", None]
     page.close()
-    with pytest.raises(Stopped):
+    with pytest.raises(PageClosedError):
         page.asked(10.0)
 
 
@@ -92,7 +92,7 @@ def test_time_that_stands_still_holds_whoever_kicks_until_a_step_is_asked_for(pa
     held.join(5.0)
     assert not held.is_alive()
     page.close()
-    with pytest.raises(Stopped):
+    with pytest.raises(PageClosedError):
         page.hold(0.0)
 
 

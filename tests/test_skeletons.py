@@ -241,14 +241,14 @@ def kicking(before: int, lying: bool = False) -> Motion:
 def test_a_kick_that_begins_with_its_strike_or_of_one_who_lies_is_refused_before_it_is_performed(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Performed(Exception):
+    class PerformedError(Exception):
         pass
 
     def perform(*arguments: object) -> None:
-        raise Performed
+        raise PerformedError
 
     monkeypatch.setattr(references, "Tracker", perform)
-    with pytest.raises(Performed):
+    with pytest.raises(PerformedError):
         references.captured(kicking(20), scene)
     with pytest.raises(InputError, match=r"the motion begins 0\.0\d s before its strike, but needs 0\.11 s"):
         references.captured(kicking(1), scene)

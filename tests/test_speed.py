@@ -15,7 +15,7 @@ from larp_model.errors import InputError
 from larp_model.physics.kinematics import morphology_of
 from larp_model.scene import Scene
 from tasks.benchmarks import engines, replays, report, speed
-from tasks.benchmarks.engines import Course, Question, Refused
+from tasks.benchmarks.engines import Course, Question, RefusedError
 from tasks.motions.references import Reference
 
 
@@ -81,7 +81,7 @@ def test_a_slow_row_says_with_how_few_steps_it_was_measured(seconds: float) -> N
 
 def test_what_does_not_fit_into_memory_is_refused_before_it_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engines, "available_memory", lambda: 1000)
-    with pytest.raises(Refused, match="of memory"):
+    with pytest.raises(RefusedError, match="of memory"):
         engines.compiled(lambda x: x @ x, jnp.zeros((64, 64)))
 
 

@@ -20,7 +20,7 @@ from larp_model.networks import Weights
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from mpc import CEM, Gradient
-from mpc.loop import Diverged, Phase, Window, execute
+from mpc.loop import DivergenceError, Phase, Window, execute
 from tasks.benchmarks import pushes, slopes, stability
 from tasks.motions.references import Reference
 
@@ -119,7 +119,7 @@ class Lost:
 def test_a_world_that_diverges_ends_the_execution_and_names_the_step(every: int) -> None:
     planner = stability.toy(stability.Shaky(np.inf), CEM(samples=4, rounds=1, elites=2))
     phase = Phase(planner, planner, every, lambda step: Window(np.zeros((6, 1, 3)), None))
-    with pytest.raises(Diverged, match="diverged in step 2"):
+    with pytest.raises(DivergenceError, match="diverged in step 2"):
         execute(Lost(), np.zeros((1, 13)), (phase,), 5, jax.random.key(0), 0.01)
 
 

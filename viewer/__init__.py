@@ -1,6 +1,6 @@
 """The viewer: draws scenes, states and plans in the browser, in a file and in a picture; knows no task."""
 
-from viewer.app import LivePage, Stopped, show
+from viewer.app import LivePage, PageClosedError, show
 from viewer.film import check_film, write_film
 from viewer.overlay import Overlay, write_overlay
 from viewer.picture import kick_picture
@@ -15,10 +15,10 @@ __all__ = [
     "LivePage",
     "Offer",
     "Overlay",
+    "PageClosedError",
     "Push",
     "Recording",
     "SceneView",
-    "Stopped",
     "Wishes",
     "check_film",
     "framed",

@@ -41,7 +41,7 @@ FOLLOWED = (-2.2, -3.2, 1.4)  # m, from the ball to a camera that follows it
 Mode = Literal["waiting", "planned", "running", "replay"]
 
 
-class Stopped(Exception):
+class PageClosedError(Exception):
     """The page was closed, or asked to stop what runs."""
 
 
@@ -188,11 +188,11 @@ class LivePage:
         return self._changes
 
     def asked(self, seconds: float = 0.0) -> str | None:
-        """What was asked for next; None where nothing was in so many seconds. Raises `Stopped` once closed."""
+        """What was asked for next; None where nothing was in so many seconds. Raises `PageClosedError` once closed."""
         end = clock.monotonic() + seconds
         while True:
             if self._closed.is_set():
-                raise Stopped
+                raise PageClosedError
             with suppress(queue.Empty):
                 return self._asked.get_nowait()
             if (left := end - clock.monotonic()) <= 0.0:
@@ -230,7 +230,7 @@ class LivePage:
                 if not self._asked.empty():
                     return  # it may be asked to end
                 self._closed.wait(FRAME)
-        raise Stopped
+        raise PageClosedError
 
     @property
     def playing(self) -> bool:

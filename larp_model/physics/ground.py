@@ -138,15 +138,17 @@ def motion_on_ground(body: Body, iterations: int, problem: GroundProblem, veloci
     return _solution(body, iterations, problem, jax.lax.stop_gradient(guess))
 
 
+NewtonCarry = tuple[Array, Array, GroundMotion]
+"""Iterations done, bodies (B,) that have not converged, and the motion."""
+
+
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _solution(body: Body, iterations: int, problem: GroundProblem, guess: GroundMotion) -> GroundMotion:
-    Carry = tuple[Array, Array, GroundMotion]
-
-    def goes_on(carry: Carry) -> Array:
+    def goes_on(carry: NewtonCarry) -> Array:
         number, unfinished, _ = carry
         return (number < iterations) & jnp.any(unfinished)
 
-    def newton(carry: Carry) -> Carry:
+    def newton(carry: NewtonCarry) -> NewtonCarry:
         number, unfinished, before = carry
         after = problem.newton(body, before)
         chosen = jax.tree.map(partial(jnp.where, unfinished), after, before)

@@ -237,7 +237,7 @@ TRACED: dict[str, Callable[[Scene, int], Traced]] = {
 STEPPED: dict[str, Callable[[Scene, int, int], BatchedTruth]] = {"mujoco": mujoco, "bullet": bullet}
 
 
-class Refused(Exception):
+class RefusedError(Exception):
     """Raised with the reason why an engine has no figure."""
 
 
@@ -249,7 +249,7 @@ class Compiled(NamedTuple):
 
 
 def compiled(program: Callable[..., Any], *arguments: Any) -> Compiled:
-    """Compile a program for these arguments; raise Refused if it needs more memory than is free."""
+    """Compile a program for these arguments; raise RefusedError if it needs more memory than is free."""
     begin = time.perf_counter()
     ready = jax.jit(program).lower(*arguments).compile()
     seconds = time.perf_counter() - begin
@@ -257,7 +257,7 @@ def compiled(program: Callable[..., Any], *arguments: Any) -> Compiled:
     if found is not None and free is not None:
         needed = found.argument_size_in_bytes + found.output_size_in_bytes + found.temp_size_in_bytes
         if needed > free:
-            raise Refused(f"needs {needed / 2**30:.1f} GiB of memory, of {free / 2**30:.1f}")
+            raise RefusedError(f"needs {needed / 2**30:.1f} GiB of memory, of {free / 2**30:.1f}")
     return Compiled(ready, seconds)
 
 
