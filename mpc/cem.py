@@ -48,7 +48,7 @@ class CEM:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Candidates in each round: samples / decay^round, at least twice the elites.
+        """Return the number of candidates in each round: samples / decay^round, at least twice the elites.
 
         Rounded up to a half, a quarter ... of `samples`, because every size is compiled apart.
         """
@@ -57,18 +57,18 @@ class CEM:
 
     @property
     def kept(self) -> int:
-        """Elites among the candidates of the next round."""
+        """Return how many elites are candidates of the next round again."""
         return max(1, math.ceil(self.keep * self.elites))
 
     def improve(self, search: Search, random: np.random.Generator, problem: Problem) -> Search:
-        """All rounds."""
+        """Return the search after all rounds."""
         for index, size in enumerate(self.sizes):
             candidates = self.sample(search, random, size, last=index == self.rounds - 1)
             search = self.update(search, candidates, problem.tries(candidates).costs)
         return search
 
     def sample(self, search: Search, random: np.random.Generator, size: int, last: bool) -> np.ndarray:
-        """Candidates (N, K, J, 3) [rad]: the kept elites, best first, draws, and at last the mean."""
+        """Return candidates (N, K, J, 3) [rad]: elites, best first, then draws, in the last round the mean as well."""
         noise = coloured_noise(random, (size, *search.mean.shape), self.exponent)
         candidates = search.mean + search.spread * noise
         candidates[: self.kept] = search.elites[: self.kept]
@@ -77,7 +77,7 @@ class CEM:
         return candidates
 
     def update(self, search: Search, candidates: np.ndarray, costs: np.ndarray) -> Search:
-        """Refits the distribution to the best that are finite; if none is, it and the elites stay.
+        """Refit the distribution to the best candidates that are finite; if none is, it and the elites stay.
 
         Where more elites are kept than there are candidates, the last of them stay too.
         """

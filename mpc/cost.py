@@ -16,18 +16,18 @@ Norm = Callable[[jax.Array], jax.Array]
 
 
 def quadratic(residual: jax.Array) -> jax.Array:
-    """Half the squared length of each vector: (*, R) -> (*)."""
+    """Return half the squared length of each vector: (*, R) -> (*)."""
     return 0.5 * jnp.sum(residual**2, axis=-1)
 
 
 def l2(width: float) -> Norm:
-    """Length of each vector, (*, R) -> (*), rounded to a parabola below `width` (residual's unit)."""
+    """Return the norm (*, R) -> (*) that is the vector's length, a parabola below `width` (residual's unit)."""
     _require_width(width)
     return partial(_rounded_length, width=width)
 
 
 def absolute(width: float) -> Norm:
-    """Sum of the absolute components, (*, R) -> (*), each rounded off below `width` (residual's unit)."""
+    """Return the norm (*, R) -> (*) that sums absolute components, each smooth below `width` (residual's unit)."""
     _require_width(width)
     return partial(_rounded_sum, width=width)
 
@@ -64,7 +64,7 @@ def residuals(
     context: Any = None,
     corrections: Mapping[str, jax.Array] | None = None,
 ) -> dict[str, jax.Array]:
-    """Each term's residual of one candidate, (R,) or (T, R), moved by the correction of its name, if there is one."""
+    """Return each term's residual of one candidate, (R,) or (T, R), plus the correction of its name, if any."""
     found = {term.name: term.residual(states, controls, context) for term in terms}
     for name, residual in found.items():
         if residual.ndim not in (1, 2):
@@ -78,7 +78,7 @@ def weighed(
     states: jax.Array,
     weights: Mapping[str, jax.Array | float] | None = None,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Cost of one candidate by its residuals and states (H', L, 13), and each term's weighted share of it.
+    """Return the cost of one candidate from its residuals and states (H', L, 13), and each term's weighted share.
 
     `weights` replaces the terms' own by name. The total is +inf where a state or the sum is not finite: such a
     candidate is never chosen. The shares are reported as they are.
@@ -98,7 +98,7 @@ def evaluate(
     context: Any = None,
     weights: Mapping[str, jax.Array | float] | None = None,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Cost of one candidate, states (H', L, 13) under controls (H, J, 3), and each term's share: see `weighed`."""
+    """Return the cost of one candidate, states (H', L, 13) under controls (H, J, 3), and the shares: see `weighed`."""
     return weighed(terms, residuals(terms, states, controls, context), states, weights)
 
 
@@ -107,7 +107,7 @@ def curvatures(
     found: Mapping[str, jax.Array],
     weights: Mapping[str, jax.Array | float] | None = None,
 ) -> dict[str, jax.Array]:
-    """By residual r, of its shape, c >= 0 so that sum(c r^2) / 2 + constant touches the cost, with its slope.
+    """Return c >= 0 for each residual r, of its shape: sum(c r^2) / 2 + constant touches the cost, with its slope.
 
     The weights of iteratively reweighted least squares (P. Holland and R. Welsch 1977): slope of the norm / r; where r
     is nearly zero, that ratio a little beside it.
@@ -125,7 +125,9 @@ def curvatures(
 
 
 def nearest_on_path(path: Any, point: Any) -> tuple[Any, Any]:
-    """Where a path (T, 3) [m], straight between its rows, comes nearest to `point` (3,) [m], and the row before that.
+    """Return the point of a path (T, 3) [m] that is nearest to `point` (3,) [m], and the row before it.
+
+    The path is straight between its rows.
 
     NumPy or JAX arrays, in their own precision. A ball flies some 10 cm between two states, so that the distance at
     the states alone overstates the miss.
@@ -140,7 +142,7 @@ def nearest_on_path(path: Any, point: Any) -> tuple[Any, Any]:
 
 
 def require_weight(name: str, weight: float) -> None:
-    """Refuses a weight that is negative or not finite."""
+    """Raise InputError for a weight that is negative or not finite."""
     if not (np.isfinite(weight) and weight >= 0):
         raise InputError(f"weight of {name!r}: got {weight}, needs a finite number >= 0")
 

@@ -1,4 +1,4 @@
-"""What the planner plans with: anything that rolls a batch of states out under a batch of controls."""
+"""Models to plan with: anything that rolls a batch of states out under a batch of controls."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ SIDE_BY_SIDE = 8
 
 
 class Dynamics(Protocol):
-    """A model of the scene; the learned simulator and the truth simulator both are one.
+    """A model of the scene; LARP and MuJoCo both are one.
 
     It may say in an attribute `side_by_side` (an integer) how many rollouts at a time take least, each, on a CPU.
     """
 
     @property
     def differentiable(self) -> bool:
-        """Whether JAX can differentiate `rollout`."""
+        """Return whether JAX can differentiate `rollout`."""
 
     def rollout(self, state: jax.Array, controls: jax.Array, *, steps: jax.Array | None = None) -> jax.Array:
-        """States (N, H', L, 13) after steps 1 to H' >= H, from state (N, L, 13), controls (N, H, J, 3) [rad].
+        """Return states (N, H', L, 13) after steps 1 to H' >= H, from state (N, L, 13), controls (N, H, J, 3) [rad].
 
         Pure, traceable by JAX, and every row independent of the others. A row that diverged holds NaN. steps (): only
         so many of the H are wanted; the rest of them repeat the last. A planner that wants all does not pass it.
@@ -34,7 +34,7 @@ class Dynamics(Protocol):
 
 
 def side_by_side(dynamics: Dynamics) -> int:
-    """Return how many candidates are rolled out at a time where they are few."""
+    """Return how many candidates are rolled out at a time in small batches."""
     return int(getattr(dynamics, "side_by_side", SIDE_BY_SIDE))
 
 
@@ -43,15 +43,15 @@ class BatchedTruth(Protocol):
 
     @property
     def batch(self) -> int:
-        """How many rows N it rolls out side by side: always exactly so many."""
+        """Return the number of rows N of every rollout: always exactly so many."""
 
     def rollout(self, states: np.ndarray, controls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """States (N, H, L, 13) from (N, L, 13) under (N, H, J, 3) [rad], and (N,) False where diverged."""
+        """Return states (N, H, L, 13) from (N, L, 13) under (N, H, J, 3) [rad], and (N,) False where diverged."""
 
 
 @dataclass(frozen=True)
 class MujocoDynamics:
-    """The truth simulator as the planner's model, called back from the compiled planner.
+    """MuJoCo as the planner's model, called back from the compiled planner.
 
     It has no gradient: the planner refuses gradient steps on it. Diverged rows come back as NaN. Rows are
     rolled out `truth.batch` at a time, the last time filled up; a few rows for each core waste least.
@@ -61,7 +61,7 @@ class MujocoDynamics:
     differentiable = False
 
     def rollout(self, state: jax.Array, controls: jax.Array, *, steps: jax.Array | None = None) -> jax.Array:
-        """See `Dynamics.rollout`; H' = H."""
+        """Return the states of `Dynamics.rollout`; H' = H."""
         shape = (*controls.shape[:2], *state.shape[1:])
         result = jax.ShapeDtypeStruct(shape, jnp.float32)
         return jax.pure_callback(self._simulate, result, state, controls, controls.shape[1] if steps is None else steps)
@@ -81,7 +81,7 @@ class MujocoDynamics:
 @jax.tree_util.register_pytree_node_class
 @dataclass(frozen=True)
 class Continued:
-    """The whole scene for H steps under control, then only `links` for `steps` more, by their own model.
+    """Dynamics of the whole scene for H steps under control, then of `links` alone for `steps` more.
 
     A flying ball is followed to its target at a fraction of the whole scene's cost. All other links stay
     frozen as step H left them. `tail` sees the states of `links` (N, links, 13) and controls (N, steps, 0,
@@ -99,16 +99,16 @@ class Continued:
 
     @property
     def differentiable(self) -> bool:
-        """True where both models are differentiable."""
+        """Return whether both models are differentiable."""
         return self.dynamics.differentiable and self.tail.differentiable
 
     @property
     def side_by_side(self) -> int:
-        """Return what the whole scene's dynamics say."""
+        """Return `side_by_side` of the whole scene's dynamics."""
         return side_by_side(self.dynamics)
 
     def rollout(self, state: jax.Array, controls: jax.Array, *, steps: jax.Array | None = None) -> jax.Array:
-        """See `Dynamics.rollout`; H' = H + `self.steps`."""
+        """Return the states of `Dynamics.rollout`; H' = H + `self.steps`."""
         states = self.dynamics.rollout(state, controls, **({} if steps is None else {"steps": steps}))
         last = states[:, -1]
         followed = self.tail.rollout(last[:, self.links], jnp.zeros((len(state), self.steps, 0, 3)))
@@ -116,11 +116,11 @@ class Continued:
         return jnp.concatenate([states, frozen.at[:, :, self.links].set(followed)], axis=1)
 
     def tree_flatten(self) -> tuple[tuple[Dynamics, Dynamics], tuple[int, int, int]]:
-        """Return the models, and what makes another program."""
+        """Return the models, and the static fields that need a program of their own."""
         return (self.dynamics, self.tail), (self.links.start, self.links.stop, self.steps)
 
     @classmethod
     def tree_unflatten(cls, rest: tuple[int, int, int], models: tuple[Dynamics, Dynamics]) -> Continued:
-        """Return what was flattened; the models may be anything."""
+        """Return the dynamics again; in JAX's hands the models may be placeholders."""
         begin, end, steps = rest
         return cls(*models, slice(begin, end), steps)

@@ -35,7 +35,7 @@ class Quadratic(NamedTuple):
     curvature: np.ndarray  # (D, D)
 
     def gain(self, coordinates: np.ndarray) -> float:
-        """Return what coordinates (D,) take off the cost."""
+        """Return by how much coordinates (D,) lower the cost."""
         return float(-self.gradient @ coordinates - 0.5 * coordinates @ self.curvature @ coordinates)
 
 
@@ -78,17 +78,17 @@ class GaussNewton:
 
     @property
     def differentiates(self) -> bool:
-        """Forward derivatives alone need gradients of the dynamics."""
+        """Return whether it needs gradients of the dynamics, which forward derivatives alone do."""
         return self.jacobian == "forward"
 
     def improve(self, search: Search, random: np.random.Generator, problem: Problem) -> Search:
-        """All rounds of every candidate that is refined."""
+        """Return the search after all rounds of every candidate that is refined."""
         for start in search.elites[: self.elites]:
             search = self.refine(start, search, random, problem)
         return search
 
     def refine(self, knots: np.ndarray, search: Search, random: np.random.Generator, problem: Problem) -> Search:
-        """All rounds from knots (K, J, 3) on; every step that was tried may become an elite.
+        """Return the search after all rounds from knots (K, J, 3) on; every step that was tried may become an elite.
 
         The neighbours that a round takes differences to are tried with the steps of the round before, when none of them
         has won yet: around the step that is expected to, or around where the steps came from if no step of the last
@@ -164,7 +164,7 @@ class GaussNewton:
     def steps(
         self, model: Quadratic, damping: float, directions: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Steps (S, K, J, 3) [rad], their coordinates (S, D) and dampings (S,); none where nothing has a slope."""
+        """Return steps (S, K, J, 3) [rad], coordinates (S, D) and dampings (S,); none where nothing has a slope."""
         mean = np.trace(model.curvature) / len(model.gradient)
         none = directions[:0], np.zeros((0, len(directions))), np.zeros(0)
         if not (np.isfinite(model.gradient).all() and 0.0 < mean < np.inf):
@@ -184,7 +184,7 @@ class GaussNewton:
 
 
 def quadratic(here: Tried, derivatives: Residuals) -> Quadratic:
-    """The cost around one candidate, whose residuals are (1, ...), along derivatives (D, ...) of them."""
+    """Return the quadratic around one candidate from its residuals (1, ...) and their derivatives (D, ...)."""
     slopes = [
         (_flat(derivatives[name]).astype(float), _flat(here.residuals[name])[0], _flat(here.curvatures[name])[0])
         for name in derivatives

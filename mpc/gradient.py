@@ -46,7 +46,7 @@ class Gradient:
                 raise InputError(f"{name}: got {getattr(self, name)}, needs a finite number > 0")
 
     def improve(self, search: Search, _random: np.random.Generator, problem: Problem) -> Search:
-        """All steps: every candidate is tried before each of them and after the last."""
+        """Return the search after all steps; every candidate is tried before each of them and after the last."""
         best = knots = self.sample(search)
         best_costs, square = np.full(len(knots), np.inf, np.float32), np.zeros_like(knots)
         for step in range(self.steps + 1):
@@ -69,15 +69,15 @@ class Gradient:
         return search._replace(elites=elites, costs=elite_costs)
 
     def sample(self, search: Search) -> np.ndarray:
-        """The candidates (N, K, J, 3) [rad] to refine: the best of the search."""
+        """Return the candidates (N, K, J, 3) [rad] to refine: the best of the search."""
         return search.elites[: self.elites]
 
     def update(
         self, scale: np.ndarray, gradient: np.ndarray, square: np.ndarray, step: int
     ) -> tuple[np.ndarray, np.ndarray, int]:
-        """A step of knots down the cost's gradient (N, K, J, 3) [1/rad], in units of the scale (J, 3) [rad].
+        """Return a step [rad] down the cost's gradient (N, K, J, 3) [1/rad], in units of the scale (J, 3) [rad].
 
-        Returns the step [rad], the running mean square, whose start is zero, and how many gradients were not finite.
+        Also the running mean square, whose start is zero, and how many gradients were not finite.
         """
         scaled, lost = self.clipped(gradient * scale)
         square = DECAY * square + (1.0 - DECAY) * scaled**2
@@ -85,7 +85,7 @@ class Gradient:
         return -self.learning_rate * scaled / np.sqrt(mean + EPSILON) * scale, square, lost
 
     def clipped(self, gradient: np.ndarray) -> tuple[np.ndarray, int]:
-        """Gradients (N, K, J, 3), in cost per spread, each knot's at most `clip` long; how many were not finite.
+        """Return gradients (N, K, J, 3) [1/spread], each knot's at most `clip` long, and how many were not finite.
 
         Those are zero: their candidates stand still.
         """

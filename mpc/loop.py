@@ -1,4 +1,4 @@
-"""The closed loop on the truth: plan, execute, shift; it records and draws nothing."""
+"""The closed loop in a world: plan, execute, shift. It records and draws nothing."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from mpc.planner import Plan, PlanInfo, Planner
 
 
 class World(Protocol):
-    """What the plan is executed in, one step at a time; `larp_model.engines.mujoco.Truth` of batch 1 is one."""
+    """The world that a plan is executed in, step by step; `larp_model.engines.mujoco.Truth` of batch 1 is one."""
 
     def reset(self, states: np.ndarray) -> None:
         """Put the world into states (1, L, 13)."""
 
     def step(self, control: np.ndarray) -> np.ndarray:
-        """States (1, L, 13) after one step under joint targets (1, J, 3) [rad]; NaN where it diverged."""
+        """Return states (1, L, 13) after one step under joint targets (1, J, 3) [rad]; NaN where it diverged."""
 
 
 class DivergenceError(RuntimeError):
-    """The world's state is no longer finite: nothing that was executed from here on would mean anything."""
+    """Raised where the world's state is no longer finite, and executing on would mean nothing."""
 
 
 class Window(NamedTuple):
-    """What the task wants of the next H steps: reference controls (H, J, 3) [rad] and the residuals' context.
+    """The task's input for the next H steps: reference controls (H, J, 3) [rad] and the residuals' context.
 
     steps: so many of the H suffice; all by default. weights: of cost terms by name, instead of their own.
     """
@@ -39,18 +39,17 @@ class Window(NamedTuple):
 
 
 def never(step: int, state: np.ndarray) -> bool:
-    """Nothing ends the phase."""
+    """Return False: nothing ends the phase."""
     return False
 
 
 class Phase(NamedTuple):
-    """A part of an execution: who plans in it, and for what.
+    """A part of an execution with its planners and windows.
 
     first: the planner of its first plan; again: of all later ones, every `every` steps. Both share horizon and knots.
-    window: what is wanted from a step on. over: whether, in a step with a state (L, 13), the phase comes to its
-    end: for `linger` steps its plan is carried on, then the next phase begins or, after the last, planning ends. A
-    phase whose first planner is the one before's `again` goes on with its plan. links: those that the planners'
-    dynamics know.
+    window: the window that begins in a step. over: whether the phase ends in a step with a state (L, 13); its plan is
+    carried on for `linger` steps, then the next phase begins or, after the last, planning ends. A phase whose first
+    planner is the one before's `again` goes on with its plan. links: those that the planners' dynamics know.
     """
 
     first: Planner
@@ -63,7 +62,7 @@ class Phase(NamedTuple):
 
 
 class Replan(NamedTuple):
-    """One planning step: when it was made, in which phase, the state (L, 13) it saw, the plan and what was found."""
+    """One planning step: its step and phase, the state (L, 13) that it began from, the plan and its `PlanInfo`."""
 
     step: int
     phase: int
@@ -74,7 +73,7 @@ class Replan(NamedTuple):
 
 @dataclass
 class Execution:
-    """What happened: states (T + 1, L, 13), joint targets (T, J, 3) [rad], and every plan on the way."""
+    """A record of an execution: states (T + 1, L, 13), joint targets (T, J, 3) [rad], and every plan on the way."""
 
     states: list[np.ndarray]
     controls: list[np.ndarray] = field(default_factory=list)
@@ -82,7 +81,7 @@ class Execution:
 
 
 class Begun(NamedTuple):
-    """What must be known of an execution that was cut off to go on with it.
+    """The part of an interrupted execution that is needed to go on with it.
 
     states (T + 1, L, 13) and controls (T, J, 3) [rad] so far; the last plan, the step and the phase it was made in.
     """
@@ -95,7 +94,7 @@ class Begun(NamedTuple):
 
     @staticmethod
     def of(execution: Execution) -> Begun:
-        """An execution so far."""
+        """Return the part of an execution so far."""
         last = execution.replans[-1]
         return Begun(np.stack(execution.states), np.stack(execution.controls), last.plan, last.step, last.phase)
 

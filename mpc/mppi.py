@@ -36,7 +36,7 @@ class MPPI:
                 raise InputError(f"{name}: got {getattr(self, name)}, needs a finite number >= {least:g}")
 
     def improve(self, search: Search, random: np.random.Generator, problem: Problem) -> Search:
-        """All rounds, and the last mean tried."""
+        """Return the search after all rounds, with the last mean tried."""
         search = search._replace(mean=search.elites[0])
         for _ in range(self.rounds):
             noise = coloured_noise(random, (self.samples, *search.mean.shape), self.exponent)
@@ -48,7 +48,7 @@ class MPPI:
         return merged(search, last, problem.tries(last).costs)
 
     def update(self, search: Search, candidates: np.ndarray, costs: np.ndarray) -> Search:
-        """The search with its mean at the weighted average; where no candidate is finite it stays."""
+        """Return the search with its mean at the weighted average; where no candidate is finite it stays."""
         finite = np.isfinite(costs)
         if not finite.any():
             return search

@@ -21,7 +21,7 @@ from mpc.spline import Interpolation, shift
 
 
 class Plan(NamedTuple):
-    """What is carried from one planning step to the next."""
+    """The state of the planner from one planning step to the next."""
 
     elites: np.ndarray  # (M, K, J, 3) rad, knots around the reference, best first
     spread: np.ndarray  # (K, J, 3) rad, standard deviation of the search's distribution
@@ -30,12 +30,12 @@ class Plan(NamedTuple):
 
     @property
     def knots(self) -> np.ndarray:
-        """The plan itself (K, J, 3) [rad]: the best candidate, never an average."""
+        """Return the knots (K, J, 3) [rad] of the best candidate, never an average."""
         return self.elites[0]
 
 
 class PlanInfo(NamedTuple):
-    """What a step found out; for looking, never carried."""
+    """Figures of one planning step; for looking, never carried to the next."""
 
     cost: float  # of the plan; inf where no candidate was finite
     terms: dict[str, float]  # each term's weighted share of the cost
@@ -50,7 +50,7 @@ class PlanInfo(NamedTuple):
 
 
 class Planner:
-    """Finds joint targets that minimise a cost over a horizon, through any dynamics.
+    """A planner of joint targets that minimise a cost over a horizon, through any dynamics.
 
         minimise over theta   sum_i w_i n_i(r_i(x_1..x_H', u_0..u_H-1, context))
         subject to            x_1..x_H' = dynamics(x_0, u_0..u_H-1)
@@ -108,7 +108,7 @@ class Planner:
         self._use(optimizers)
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but what is compiled: copies, and other processes, compile their own."""
+        """Return all but compiled programs: copies, and other processes, compile their own."""
         return {name: value for name, value in self.__dict__.items() if name != "_controls"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -116,7 +116,7 @@ class Planner:
         self._controls = jax.jit(self._equations.controls)
 
     def using(self, optimizers: Optimizer | Sequence[Optimizer]) -> Planner:
-        """A planner of the same problem with other optimisers, which shares all that is compiled."""
+        """Return a planner of the same problem with other optimisers, which shares compiled programs."""
         other = object.__new__(Planner)
         other.__dict__.update(self.__dict__)
         other._use(optimizers)
@@ -138,7 +138,7 @@ class Planner:
         self.elites = max(optimizer.elites for optimizer in self.optimizers)
 
     def init(self, key: jax.Array, now: float = 0.0) -> Plan:
-        """The plan that follows the reference from `now` [s]; its other elites are drawn around it."""
+        """Return the plan that follows the reference from `now` [s]; its other elites are drawn around it."""
         random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
         spread = np.broadcast_to(self.scale, (len(self.knot_times), *self.scale.shape))
         elites = coloured_noise(random, (self.elites, *spread.shape), COLOUR) * spread
@@ -155,7 +155,7 @@ class Planner:
         now: float = 0.0,
         steps: int | None = None,
     ) -> tuple[Plan, PlanInfo]:
-        """Plans the window that starts `now` [s] in `state` (L, 13), warm-started by the last plan.
+        """Plan the window that starts `now` [s] in `state` (L, 13), warm-started by the last plan.
 
         `reference` (H, J, 3) [rad] are the controls to start from in this window; `context` any pytree of
         arrays that the residuals take; `weights` replace those of the terms they name. `steps` of the H suffice,
@@ -199,7 +199,7 @@ class Planner:
         weights: Mapping[str, float] | None = None,
         steps: int | None = None,
     ) -> float:
-        """Compiles ahead what a first plan with arguments of these shapes uses, by making it; returns the seconds."""
+        """Compile the programs of a first plan with arguments of these shapes, by making it; return the seconds."""
         _, info = self.step(self.init(jax.random.key(0)), state, reference, context, weights, 0.0, steps)
         return info.compile_seconds
 
@@ -213,7 +213,7 @@ class Planner:
         steps: int | None = None,
         count: int = 16,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What lies around a plan that was just made in `state`, for looking: costs (N,) and states (N, H', L, 13).
+        """Return costs (N,) and states (N, H', L, 13) of candidates around a plan made in `state`, for looking.
 
         Candidates are drawn with half the plan's spread, the same ones each time. For the other arguments see `step`,
         whose programs serve here too.
@@ -224,7 +224,7 @@ class Planner:
         return problem.shown(plan.knots + 0.5 * plan.spread * noise)
 
     def controls(self, plan: Plan, reference: ArrayLike) -> jax.Array:
-        """Joint targets (H, J, 3) [rad] of the plan, given the reference (H, J, 3) it was made around."""
+        """Return joint targets (H, J, 3) [rad] of the plan, given the reference (H, J, 3) it was made around."""
         return self._controls(plan.knots, self._reference(reference))
 
     def _shift(self, elites: jax.Array, spread: jax.Array, elapsed: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -233,7 +233,7 @@ class Planner:
         return elites, shift(spread, times, elapsed, "linear")  # a cubic could swing below zero
 
     def _shifted(self, plan: Plan, elapsed: float, random: np.random.Generator) -> Search:
-        """The last plan's search as it looks `elapsed` [s] later, its spread widened, its costs unknown.
+        """Return the last plan's search shifted by `elapsed` [s], its spread widened, its costs unknown.
 
         Where the last planner kept fewer elites, the others are drawn around its plan.
         """
@@ -256,7 +256,7 @@ class Planner:
         now: float,
         steps: int | None,
     ) -> Wanted:
-        """The public arguments, checked, as arrays of fixed shape and type."""
+        """Return the public arguments, checked, as arrays of fixed shape and type."""
         state = np.asarray(state, np.float32)
         if state.ndim != 2 or state.shape[1] != 13:
             raise InputError(f"state: got shape {state.shape}, needs (L, 13)")
@@ -285,7 +285,7 @@ class Planner:
         return reference if isinstance(reference, jax.core.Tracer) else _array(reference)
 
     def _check(self) -> None:
-        """Refuses what would fail later, or silently, by the name of the argument."""
+        """Raise InputError, with the argument's name, for what would fail later or silently."""
         if not (np.isfinite(self.scale).all() and (self.scale >= 0).all()):
             raise InputError(f"spread: got {self.scale.tolist()}, needs finite numbers >= 0")
         if not (self.lower <= self.upper).all():
@@ -304,7 +304,7 @@ def _entropy(random: np.random.Generator) -> np.ndarray:
 
 
 def _array(value: ArrayLike) -> np.ndarray:
-    """An array of 32 bits whose type does not depend on whether a Python or a NumPy number came in."""
+    """Return an array of 32 bits, whether a Python or a NumPy number came in."""
     array = np.asarray(value)
     if jnp.issubdtype(array.dtype, jnp.floating):
         return array.astype(np.float32)

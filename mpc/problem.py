@@ -1,4 +1,4 @@
-"""The planner's problem: its equations, compiled, and what the optimisers of one plan may ask of it."""
+"""The planner's problem: its equations, compiled, and the interface that optimisers of one plan see."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FEW = 32
 
 
 class Wanted(NamedTuple):
-    """What one plan is for: arrays of NumPy, and of JAX in what is compiled."""
+    """Inputs of one plan: NumPy arrays, and JAX arrays inside compiled programs."""
 
     state: Any  # (L, 13), where it starts
     reference: Any  # (H, J, 3) rad
@@ -48,12 +48,12 @@ class Equations:
     upper: np.ndarray
 
     def controls(self, knots: jax.Array, reference: jax.Array) -> jax.Array:
-        """Joint targets (H, J, 3) [rad] of knots (K, J, 3) around a reference (H, J, 3)."""
+        """Return joint targets (H, J, 3) [rad] of knots (K, J, 3) around a reference (H, J, 3)."""
         times = jnp.asarray(self.knot_times), jnp.asarray(self.control_times)
         return jnp.clip(reference + interpolate(knots, *times, self.interpolation), self.lower, self.upper)
 
     def roll_out(self, dynamics: Dynamics, wanted: Wanted, knots: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """States (N, H', L, 13) and controls (N, H, J, 3) of knots (N, K, J, 3)."""
+        """Return states (N, H', L, 13) and controls (N, H, J, 3) of knots (N, K, J, 3)."""
         controls = jax.vmap(self.controls, (0, None))(knots, wanted.reference)
         start = jnp.broadcast_to(wanted.state, (len(knots), *wanted.state.shape))
         return dynamics.rollout(start, controls, **({} if wanted.steps is None else {"steps": wanted.steps})), controls
@@ -61,7 +61,7 @@ class Equations:
     def weigh(
         self, wanted: Wanted, states: jax.Array, controls: jax.Array, corrections: Any
     ) -> tuple[jax.Array, Any, Any]:
-        """Costs, residuals and their curvatures of N candidates, the residuals moved by corrections."""
+        """Return costs, residuals plus corrections, and their curvatures, of N candidates."""
 
         def one(states: jax.Array, controls: jax.Array) -> tuple[jax.Array, Any, Any]:
             found = residuals(self.terms, states, controls, wanted.context, corrections)
@@ -73,7 +73,7 @@ class Equations:
     def gradients(
         self, dynamics: Dynamics, wanted: Wanted, knots: jax.Array, corrections: Any
     ) -> tuple[jax.Array, Any, jax.Array]:
-        """Gradients (N, K, J, 3) of the costs of knots (N, K, J, 3), what `weigh` finds, and the states."""
+        """Return gradients (N, K, J, 3) of the costs of knots (N, K, J, 3), the result of `weigh`, and the states."""
 
         def summed(knots: jax.Array) -> tuple[jax.Array, Any]:
             states, controls = self.roll_out(dynamics, wanted, knots)
@@ -84,7 +84,7 @@ class Equations:
         return gradient, tried, states
 
     def tangents(self, dynamics: Dynamics, wanted: Wanted, knots: jax.Array, directions: jax.Array) -> Any:
-        """Derivatives (D, ...) of the residuals at knots (K, J, 3) along directions (D, K, J, 3)."""
+        """Return derivatives (D, ...) of the residuals at knots (K, J, 3) along directions (D, K, J, 3)."""
 
         def found(knots: jax.Array) -> Any:
             states, controls = (leaf[0] for leaf in self.roll_out(dynamics, wanted, knots[None]))
@@ -93,7 +93,7 @@ class Equations:
         return jax.vmap(lambda direction: jax.jvp(found, (knots,), (direction,))[1])(directions)
 
     def judge(self, wanted: Wanted, knots: jax.Array, states: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Cost and each term's share of knots (K, J, 3) that led to states (H', L, 13)."""
+        """Return the cost and each term's share of knots (K, J, 3) that led to states (H', L, 13)."""
         controls = self.controls(knots, wanted.reference)
         return evaluate(self.terms, states, controls, wanted.context, wanted.weights)
 
@@ -106,11 +106,11 @@ class Programs:
         self._compiled: dict[Any, Any] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Copies begin without compiled programs, which cannot be copied."""
+        """Return no compiled programs, which cannot be copied."""
         return self.__dict__ | {"_compiled": {}}
 
     def __call__(self, name: Any, function: Callable[..., Any], *arguments: Any) -> Any:
-        """What the function gives, finished, compiled first where needed; `name` stands for the function."""
+        """Return the function's finished result, compiled first where needed; `name` stands for the function."""
         leaves, structure = jax.tree.flatten(arguments)
         signature = name, structure, tuple((np.shape(leaf), leaf.dtype) for leaf in leaves)
         if signature not in self._compiled:
@@ -123,7 +123,7 @@ class Programs:
 
 @dataclass
 class Record:
-    """What was tried while one plan was made."""
+    """A record of the candidates that were tried while one plan was made."""
 
     costs: list[np.ndarray] = field(default_factory=list)
     verified: int = 0
@@ -180,19 +180,19 @@ class PlannerProblem:
         return replace(self, corrections={name: each[0] for name, each in corrections.items()}, known={})
 
     def states_of(self, knots: np.ndarray) -> np.ndarray:
-        """What the dynamics make of knots (K, J, 3): states (H', L, 13)."""
+        """Return the states (H', L, 13) of knots (K, J, 3)."""
         if knots.tobytes() not in self.record.best:
             self.tries(knots[None])
         return self.record.best[knots.tobytes()]
 
     def shown(self, knots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Costs (N,) and states (N, H', L, 13) of knots (N, K, J, 3), for looking: they are not recorded."""
+        """Return costs (N,) and states (N, H', L, 13) of knots (N, K, J, 3), for looking: they are not recorded."""
         dynamics = self.equations.dynamics
         tried, states = self._rolled(dynamics, knots, side_by_side(dynamics))
         return np.asarray(tried[0]), np.asarray(states)
 
     def judged(self, knots: np.ndarray) -> tuple[float, dict[str, float]]:
-        """Cost of knots (K, J, 3) and each term's share of it."""
+        """Return the cost of knots (K, J, 3) and each term's share of it."""
         cost, terms = self.run("judge", self.equations.judge, self.wanted, knots, self.states_of(knots))
         return float(cost), {name: float(value) for name, value in terms.items()}
 
@@ -200,7 +200,7 @@ class PlannerProblem:
         return self._recorded(knots, *self._rolled(dynamics, knots, size))
 
     def _rolled(self, dynamics: Dynamics, knots: np.ndarray, size: int) -> tuple[Any, Any]:
-        """What `weigh` finds of knots, and their states: `size` at a time, the last ones filled up."""
+        """Return the result of `weigh` for knots, and their states: `size` at a time, the last ones filled up."""
         name, found = ("roll out", id(dynamics)), []
         roll_out, arguments = called(self.equations.roll_out, dynamics)
         for begin in range(0, len(knots), size):
@@ -222,7 +222,7 @@ class PlannerProblem:
 
 
 def called(function: Callable[..., Any], dynamics: Dynamics) -> tuple[Callable[..., Any], tuple[Dynamics, ...]]:
-    """Return what to compile of a function whose first argument are dynamics, and the arguments that come first.
+    """Return the function to compile of one whose first argument are dynamics, and its leading arguments.
 
     Dynamics that are a pytree of arrays are an argument: others of the same structure then need not be compiled again.
     """

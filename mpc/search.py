@@ -1,4 +1,4 @@
-"""What optimisers share: the state of a search, what they may ask of a problem, the ranking of candidates, noise.
+"""Interfaces of optimisers: the state of a search, the problem that they see, ranking of candidates, noise.
 
 Optimisers run on the host, in NumPy; the model's work is done by the problem's compiled programs, which all rounds,
 optimisers and planners of a problem share.
@@ -18,7 +18,7 @@ COLOUR = 2.0
 
 
 class Search(NamedTuple):
-    """What one optimiser hands to the next within a plan."""
+    """The state of a search, handed from one optimiser to the next within a plan."""
 
     mean: np.ndarray  # (K, J, 3) rad, centre of the sampling distribution
     spread: np.ndarray  # (K, J, 3) rad, its standard deviation
@@ -36,7 +36,7 @@ Enough = tuple[tuple[str, float], ...]
 
 
 class Tried(NamedTuple):
-    """What N candidates came to."""
+    """Results of N candidates."""
 
     costs: np.ndarray  # (N,), +inf where a candidate is not finite
     residuals: Residuals
@@ -53,59 +53,59 @@ class Tried(NamedTuple):
 
 
 class Problem(Protocol):
-    """What an optimiser may ask. Every cost that is found is counted by the planner."""
+    """The problem as an optimiser sees it. The planner counts every cost that is computed."""
 
     def tries(self, knots: np.ndarray) -> Tried:
-        """Knots (N, K, J, 3) [rad], rolled out in the planner's own dynamics."""
+        """Return the results of knots (N, K, J, 3) [rad], rolled out in the planner's own dynamics."""
 
     def gradients(self, knots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Costs (N,) of knots (N, K, J, 3) and their gradients (N, K, J, 3) [1/rad], as they are."""
+        """Return costs (N,) of knots (N, K, J, 3) and their gradients (N, K, J, 3) [1/rad], unclipped."""
 
     def tangents(self, knots: np.ndarray, directions: np.ndarray) -> Residuals:
-        """Derivatives of the residuals at knots (K, J, 3) along D directions (D, K, J, 3), (D, ...) by term."""
+        """Return derivatives of the residuals at knots (K, J, 3) along D directions (D, K, J, 3), (D, ...) by term."""
 
     def lost(self, count: int) -> None:
-        """So many candidates could not be tried, because a gradient was not finite."""
+        """Count candidates that could not be tried, because a gradient was not finite."""
 
     @property
     def carried(self) -> np.ndarray:
-        """Knots (K, J, 3) [rad] of the last plan, carried on."""
+        """Return knots (K, J, 3) [rad] of the last plan, shifted to now."""
 
     def trials(self, dynamics: Any, knots: np.ndarray) -> Tried:
-        """`tries` in other dynamics, without corrections; counted apart."""
+        """Return `tries` in other dynamics, without corrections; counted apart."""
 
     def corrected(self, corrections: Residuals) -> Problem:
-        """The same problem with something added to the residuals of every candidate, (1, ...) by term."""
+        """Return the problem with something added to the residuals of every candidate, (1, ...) by term."""
 
 
 @runtime_checkable
 class Optimizer(Protocol):
-    """A way to better candidates: whatever is given, what comes out is no worse. Its fields are its settings.
+    """An optimiser: the candidates that it returns are no worse than those it gets. Its fields are its settings.
 
     One that ranks by other dynamics than the planner's own says so (`settles = True`), and comes last.
     """
 
     @property
     def differentiates(self) -> bool:
-        """Whether it cannot do without gradients of the dynamics."""
+        """Return whether it needs gradients of the dynamics."""
 
     @property
     def elites(self) -> int:
-        """How many of the best candidates it needs."""
+        """Return how many of the best candidates it needs."""
 
     def improve(self, search: Search, random: np.random.Generator, problem: Problem) -> Search:
-        """The search after all rounds, with as many elites as before, ranked by what they cost."""
+        """Return the search after all rounds, with as many elites as before, ranked by what they cost."""
 
 
 def require_enough(enough: Enough) -> None:
-    """Refuses lengths that are none."""
+    """Raise InputError for lengths that are negative or not finite."""
     for name, length in enough:
         if not 0.0 <= length < np.inf:
             raise InputError(f"enough: got {length} for {name!r}, needs a finite number >= 0")
 
 
 def suffices(enough: Enough, cost: float, residuals: Residuals) -> bool:
-    """Whether one candidate, of this cost and residuals (1, ...), is good enough."""
+    """Return whether one candidate, of this cost and residuals (1, ...), is good enough."""
     for name, _ in enough:
         if name not in residuals:
             raise InputError(f"enough: got {name!r}, needs names of cost terms: {', '.join(residuals)}")
@@ -114,13 +114,13 @@ def suffices(enough: Enough, cost: float, residuals: Residuals) -> bool:
 
 
 def best_first(knots: np.ndarray, costs: np.ndarray, count: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """The `count` cheapest of knots (N, K, J, 3) and their costs (N,), or all; infinite ones last, ties in order."""
+    """Return the `count` cheapest of knots (N, K, J, 3) and costs (N,), or all; infinite ones last, ties in order."""
     order = np.argsort(costs, kind="stable")[:count]
     return knots[order], costs[order]
 
 
 def distinct(knots: np.ndarray) -> np.ndarray:
-    """Rows of knots (N, K, J, 3) that are not copies of an earlier one, in their order."""
+    """Return the rows of knots (N, K, J, 3) that are not copies of an earlier one, in their order."""
     first: dict[bytes, int] = {}
     for row, each in enumerate(knots):
         first.setdefault(each.tobytes(), row)
@@ -128,7 +128,7 @@ def distinct(knots: np.ndarray) -> np.ndarray:
 
 
 def merged(search: Search, knots: np.ndarray, costs: np.ndarray) -> Search:
-    """The search with new candidates (N, K, J, 3) of known costs (N,) among its elites, copies last and unknown."""
+    """Return the search with candidates (N, K, J, 3) of costs (N,) among its elites; copies last, at cost inf."""
     both, known = best_first(np.concatenate([search.elites, knots]), np.concatenate([search.costs, costs]), None)
     once = distinct(both)
     copies = np.setdiff1d(np.arange(len(both)), once)
@@ -137,7 +137,7 @@ def merged(search: Search, knots: np.ndarray, costs: np.ndarray) -> Search:
 
 
 def coloured_noise(random: np.random.Generator, shape: tuple[int, ...], exponent: float) -> np.ndarray:
-    """Normal noise (N, K, J, 3) of unit variance whose power along the K knots falls as frequency^-exponent.
+    """Return normal noise (N, K, J, 3) of unit variance whose power along the K knots falls as frequency^-exponent.
 
     0 is white, 2 a random walk's: neighbouring knots move together (Pinneri et al. 2020, "iCEM").
     """
@@ -147,7 +147,7 @@ def coloured_noise(random: np.random.Generator, shape: tuple[int, ...], exponent
 
 @functools.cache
 def _colour(count: int, exponent: float) -> np.ndarray:
-    """Square root (K, K) of the noise's covariance, cut from twice the length so that the ends differ."""
+    """Return the square root (K, K) of the noise's covariance, cut from twice the length so that the ends differ."""
     index = np.arange(2 * count)
     frequency = np.maximum(np.minimum(index, 2 * count - index), 1)
     covariance = np.fft.ifft(frequency.astype(float) ** -exponent).real[:count]

@@ -9,7 +9,7 @@ Interpolation = Literal["linear", "cubic"]
 
 
 def interpolate(knots: jax.Array, knot_times: jax.Array, times: jax.Array, kind: Interpolation = "cubic") -> jax.Array:
-    """Values (H, *D) at `times` (H,) of the spline through `knots` (K, *D) at rising `knot_times` (K,) [s].
+    """Return values (H, *D) at `times` (H,) of the spline through `knots` (K, *D) at rising `knot_times` (K,) [s].
 
     Linear in the knots, and through every one of them. "cubic" is the Hermite spline whose slope at a knot is
     the chord between its neighbours (Catmull and Rom 1974). Before the first and after the last knot it is
@@ -33,7 +33,7 @@ def interpolate(knots: jax.Array, knot_times: jax.Array, times: jax.Array, kind:
 def shift(
     knots: jax.Array, knot_times: jax.Array, elapsed: jax.Array | float, kind: Interpolation = "cubic"
 ) -> jax.Array:
-    """The same trajectory `elapsed` [s] later: knots (K, *D) sampled at knot_times + elapsed, the end held.
+    """Return the trajectory `elapsed` [s] later: knots (K, *D) at knot_times + elapsed, constant beyond the end.
 
     Exact where `elapsed` is a multiple of the (even) knot spacing, a smoothing otherwise.
     """
@@ -41,7 +41,7 @@ def shift(
 
 
 def _slopes(knots: jax.Array, knot_times: jax.Array) -> jax.Array:
-    """Chord between the neighbours of each knot (K, *D) [1/s], one-sided at the ends."""
+    """Return the chord between the neighbours of each knot (K, *D) [1/s], one-sided at the ends."""
     after = jnp.minimum(jnp.arange(len(knots)) + 1, len(knots) - 1)
     before = jnp.maximum(jnp.arange(len(knots)) - 1, 0)
     return (knots[after] - knots[before]) / _column(knot_times[after] - knot_times[before], knots.ndim)

@@ -1,4 +1,4 @@
-"""Optimisers that are called upon only where the plan is not good enough yet."""
+"""Optimisers that run only where the plan is not good enough yet."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mpc.search import Enough, Optimizer, Problem, Search, require_enough, suffi
 
 @dataclass(frozen=True)
 class Unless:
-    """Nothing, where the best candidate's residuals are short `enough`; else these optimisers, one after the other.
+    """A fallback: these optimisers, one after the other, unless the best candidate's residuals are short `enough`.
 
     A way out of where descent got stuck, for the price of one candidate everywhere else.
     """
@@ -31,16 +31,16 @@ class Unless:
 
     @property
     def differentiates(self) -> bool:
-        """As any of its optimisers does."""
+        """Return whether any of its optimisers needs gradients."""
         return any(each.differentiates for each in self.optimizers)
 
     @property
     def elites(self) -> int:
-        """As many as any of its optimisers needs."""
+        """Return the largest number that any of its optimisers needs."""
         return max(each.elites for each in self.optimizers)
 
     def improve(self, search: Search, random: np.random.Generator, problem: Problem) -> Search:
-        """The search as it is, or after all rounds of all optimisers."""
+        """Return the search as it is, or after all rounds of all optimisers."""
         best = problem.tries(search.elites[:1])
         if suffices(self.enough, float(best.costs[0]), best.residuals):
             return search

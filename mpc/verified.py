@@ -1,4 +1,4 @@
-"""Candidates tried in truer dynamics than the planner's own, and what that teaches the search."""
+"""Candidates verified in truer dynamics than the planner's own, whose results correct the search."""
 
 from __future__ import annotations
 
@@ -55,16 +55,19 @@ class Verified:
 
     @property
     def differentiates(self) -> bool:
-        """As its optimizer does."""
+        """Return whether its optimizer needs gradients."""
         return self.optimizer.differentiates
 
     @property
     def elites(self) -> int:
-        """How many of the best candidates it needs."""
+        """Return how many of the best candidates it needs."""
         return max(self.candidates, self.optimizer.elites)
 
     def improve(self, search: Search, random: np.random.Generator, problem: Problem) -> Search:
-        """All rounds, until the cheapest trial is `enough`; the elites are ranked by the truer dynamics."""
+        """Return the search after all rounds, or once the cheapest trial is `enough`.
+
+        The elites are ranked by the truer dynamics.
+        """
         tried: list[Trial] = []
         proposed = np.concatenate([search.elites[:1], problem.carried[None], search.elites[1:]])
         for index in range(self.rounds):
@@ -94,7 +97,7 @@ class Verified:
 
     @staticmethod
     def corrected(best: Trial, problem: Problem) -> Problem:
-        """The problem whose residuals are right for the best candidate; as it is where the planner's own are lost."""
+        """Return the problem with residuals right for the best candidate; the same one where the planner's are lost."""
         if not np.isfinite(best.cost):
             return problem
         believed = problem.tries(best.knots[None])
@@ -104,6 +107,6 @@ class Verified:
 
 
 def untried(knots: np.ndarray, tried: list[Trial]) -> np.ndarray:
-    """Those of knots (N, K, J, 3) that were not tried yet, in their order, each once."""
+    """Return the knots (N, K, J, 3) that were not tried yet, in their order, each once."""
     known = {trial.knots.tobytes() for trial in tried}
     return knots[[row for row in distinct(knots) if knots[row].tobytes() not in known]]
