@@ -53,7 +53,7 @@ class Anatomy(NamedTuple):
 
 
 def _shared(motor: Motor, joints: int) -> Motor:
-    """The motor of each of so many joints that are in a row what one joint with this motor is."""
+    """Return the motor of each of some joints in a row that together act as one joint with this motor."""
     x, y, z = motor.lower
     lower = x / joints, y / joints, z / joints
     x, y, z = motor.upper

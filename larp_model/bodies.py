@@ -25,7 +25,7 @@ def _positive(**values: float) -> None:
 
 
 def ball(name: str = "ball", radius: float = 0.11, mass: float = 0.43, surface: Surface = BALL_SURFACE) -> Body:
-    """A ball; by default a FIFA size 5 football. radius [m], mass [kg]."""
+    """Return a ball; by default a FIFA size 5 football. radius [m], mass [kg]."""
     _positive(radius=radius, mass=mass)
     return Body(name, "ball", (Link("ball", 0.0, radius, mass),), surface=surface)
 
@@ -33,13 +33,13 @@ def ball(name: str = "ball", radius: float = 0.11, mass: float = 0.43, surface: 
 def capsule(
     name: str = "capsule", length: float = 0.4, radius: float = 0.08, mass: float = 1.0, surface: Surface = BALL_SURFACE
 ) -> Body:
-    """A single free capsule. length (between the hemispheres' centres), radius [m], mass [kg]."""
+    """Return a single free capsule. length (between the hemispheres' centres), radius [m], mass [kg]."""
     _positive(length=length, radius=radius, mass=mass)
     return Body(name, "capsule", (Link("capsule", length, radius, mass),), surface=surface)
 
 
 def chain(name: str = "chain", links: int = 4, length: float = 0.3, radius: float = 0.06, mass: float = 1.0) -> Body:
-    """Capsules in a row, tied end to end by ball joints without motors. length, radius [m], mass of each [kg]."""
+    """Return capsules in a row, tied by ball joints without motors. length, radius [m] and mass [kg] of each."""
     if not isinstance(links, int) or links < 1:
         raise InputError(f"links is {links!r}, but must be an integer of at least 1")
     _positive(length=length, radius=radius, mass=mass)
@@ -59,7 +59,7 @@ def human(
     detail: Detail = "lean",
     motors: dict[str, float] | None = None,
 ) -> Body:
-    """A human, standing upright in its rest pose, arms hanging, facing x, left towards y.
+    """Return a human, standing upright in its rest pose, arms hanging, facing x, left towards y.
 
     height [m] and mass [kg] scale every segment. `lengths` and `radii` multiply single segments, by segment name
     without its side ("thigh", "foot", ...). detail: 13 links, or the full 26; see `anatomy`. Motors are in proportion,
@@ -87,12 +87,12 @@ def human(
 
 
 def segment_of(link: str) -> str:
-    """The name of a human's link without its side."""
+    """Return the name of a human's link without its side."""
     return link.removeprefix("left_").removeprefix("right_")
 
 
 def detail_of(body: Body) -> Detail:
-    """In which detail a human is modelled; refuses other bodies."""
+    """Return the level of detail of a human; raise InputError for other bodies."""
     for detail, kind in KINDS.items():
         if body.kind == kind:
             return detail
@@ -120,7 +120,7 @@ def _without_motors(body: Body) -> tuple[Joint, ...]:
 
 
 def _usual_human(name: str, detail: Detail) -> Body:
-    """A human of 1.75 m and 70 kg."""
+    """Return a human of 1.75 m and 70 kg."""
     anatomy = ANATOMIES[detail]
     rows = [
         *((segment, "") for segment in anatomy.middle),
@@ -148,7 +148,7 @@ def _usual_human(name: str, detail: Detail) -> Body:
 def human_and_ball(
     height: float = 1.75, mass: float = 70.0, dt: float = 0.01, detail: Detail = "lean", self_contact: bool = False
 ) -> Scene:
-    """The kick's scene: a human and a football, which its `kicking_links` can touch; detail: see `human`.
+    """Return the kick's scene: a human and a football, which its `kicking_links` can touch; detail: see `human`.
 
     self_contact: whether one leg can touch the other, below the knee; else they pass through each other.
     """
@@ -157,24 +157,24 @@ def human_and_ball(
 
 
 def human_and_capsule(height: float = 1.75, mass: float = 70.0, dt: float = 0.01) -> Scene:
-    """A human who can kick a capsule with thighs, shins and feet."""
+    """Return the scene of a human who can kick a capsule with thighs, shins and feet."""
     return kicking(human(height=height, mass=mass), capsule(), dt)
 
 
 def kicking_links(person: Body) -> tuple[str, ...]:
-    """Names of a human's links that can touch what it kicks: thighs, shins, feet, and toes if it has them."""
+    """Return the names of a human's links that can touch what it kicks: thighs, shins, feet, and toes if any."""
     return tuple(link.name for link in person.links if segment_of(link.name) in ("thigh", "shin", "foot", "toes"))
 
 
 def _legs(person: Body) -> Pair:
-    """One leg against the other, below the knee: above it they touch whenever one stands, and flesh gives way."""
+    """Return the pair of both legs below the knee: above it they touch whenever one stands, and flesh gives way."""
     below = [name for name in kicking_links(person) if segment_of(name) != "thigh"]
     left, right = (tuple(name for name in below if name.startswith(side)) for side in ("left_", "right_"))
     return Pair(person.name, person.name, left, right, LEG_SURFACE)
 
 
 def kicking(person: Body, struck: Body, dt: float = 0.01) -> Scene:
-    """The scene of a human and what it kicks, of one link or more, with its `kicking_links`."""
+    """Return the scene of a human and what it kicks, of one link or more, with its `kicking_links`."""
     touching = tuple(link.name for link in struck.links)
     return Scene(
         (person, struck), (Pair(person.name, struck.name, kicking_links(person), touching, struck.surface),), dt
@@ -182,23 +182,23 @@ def kicking(person: Body, struck: Body, dt: float = 0.01) -> Scene:
 
 
 def two_chains(links: int = 2, dt: float = 0.01) -> Scene:
-    """Two chains of so many links each, all of which can touch the other chain's."""
+    """Return the scene of two chains of so many links each, all of which can touch the other chain's."""
     return _colliding(chain("first", links), chain("second", links), dt)
 
 
 def two_balls(dt: float = 0.01) -> Scene:
-    """Two footballs that can touch."""
+    """Return the scene of two footballs that can touch."""
     return _colliding(ball("first"), ball("second"), dt)
 
 
 def _colliding(first: Body, second: Body, dt: float) -> Scene:
-    """Two bodies with the same links."""
+    """Return the scene of two bodies with the same links."""
     links = tuple(link.name for link in first.links)
     return Scene((first, second), (Pair(first.name, second.name, links, links, first.surface),), dt)
 
 
 def standing_height(body: Body) -> float:
-    """Height of a human's pelvis above the ground in its rest pose [m]."""
+    """Return the height of a human's pelvis above the ground in its rest pose [m]."""
     height, index = 0.0, body.link("left_foot")
     while index:
         joint = body.joints[index - 1]

@@ -1,4 +1,4 @@
-"""What the installed commands start. The packages have common names, so that another's may hide one of ours."""
+"""Entry points of the installed commands. The packages have common names, so that another's may hide one of ours."""
 
 from __future__ import annotations
 
@@ -11,32 +11,32 @@ HOME = Path(__file__).resolve().parents[1]
 
 
 def kick() -> None:
-    """`larp-kick`: plan a kick and execute it."""
+    """Run `larp-kick`: plan a kick and execute it."""
     _start("tasks.kick")
 
 
 def train() -> None:
-    """`larp-train`: from nothing to weights."""
+    """Run `larp-train`: train networks from nothing."""
     _start("tasks.train")
 
 
 def adapt() -> None:
-    """`larp-adapt`: fit weights to a motion and a body."""
+    """Run `larp-adapt`: fit weights to a motion and a body."""
     _start("tasks.adapt")
 
 
 def pose() -> None:
-    """`larp-pose`: motion from keypoints."""
+    """Run `larp-pose`: motion from keypoints."""
     _start("tasks.pose")
 
 
 def bench() -> None:
-    """`larp-bench`: the benchmarks."""
+    """Run `larp-bench`: the benchmarks."""
     _start("tasks.benchmarks.__main__")
 
 
 def hidden() -> str | None:
-    """What is wrong where a package of another project has the name of one of ours; None where all is well."""
+    """Return what is wrong if a package of another project has the name of one of ours; None if none has."""
     for name in ("mpc", "viewer", "tasks"):
         spec = find_spec(name)
         found = None if spec is None or spec.origin is None else Path(spec.origin).resolve().parent

@@ -27,7 +27,7 @@ DIVERGED = 20.0
 
 
 def evaluate(simulator: Simulator, episodes: Trajectories, windows: Sequence[int]) -> dict[str, Any]:
-    """Errors over the first n steps of every episode, n in `windows`, and of launches.
+    """Return errors over the first n steps of every episode, n in `windows`, and of launches.
 
     windows: {n: {body: mean distance of its links [m]}}; rotation_rad and displacement_m over the longest window. None
     where all predictions diverged. launch: `Launches.summary` from the true state 0 and 3 steps before first contact.
@@ -64,14 +64,14 @@ def evaluate(simulator: Simulator, episodes: Trajectories, windows: Sequence[int
 
 
 def launched(simulator: Simulator, episodes: Trajectories) -> dict[str, Any]:
-    """`Launches.summary` from the true state 0 and 3 steps before first contact; empty where nothing can be struck."""
+    """Return `Launches.summary` from the true state 0 and 3 steps before contact; empty if nothing can be struck."""
     if launches.struck(simulator.scene) is None:
         return {}
     return {str(before): launches.launches_of(simulator, episodes, before).summary for before in (0, 3)}
 
 
 def novelty(simulator: Simulator, states: np.ndarray, controls: np.ndarray) -> float:
-    """How far a trajectory of states (T + 1, L, 13) under controls (T, J, 3) [rad] is from what was learned.
+    """Return how far states (T + 1, L, 13) under controls (T, J, 3) [rad] are from the training data.
 
     Root mean square, over steps and features, of what the networks of the bodies see, in standard deviations of their
     training data, over which it is 1; of the body that is furthest from its own. Contacts are left out: where links
@@ -89,17 +89,17 @@ def _novelty(model: Model, weights: Weights, before: Array, after: Array, contro
 
 
 def distances(predicted: np.ndarray, episodes: Trajectories, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """How far links are from the truth, (E, steps, L) [m], and (E,) which episodes were predicted without diverging."""
+    """Return the links' distance from the ground truth (E, steps, L) [m], and (E,) which episodes did not diverge."""
     apart = predicted[:, :steps, :, packed.POSITION] - episodes.states[:, 1 : steps + 1, :, packed.POSITION]
     distance = np.linalg.norm(apart, axis=-1)
     return distance, np.isfinite(distance).all(axis=(1, 2)) & (distance.max(axis=(1, 2)) < DIVERGED)
 
 
 def by_window(scene: Scene, distance: np.ndarray, windows: Sequence[int]) -> dict[str, dict[str, float | None]]:
-    """Mean distance [m] of every body's links over the first n steps, n in `windows`; of distances (E, H, L)."""
+    """Return the mean distance [m] of each body's links over the first n steps, n in `windows`, of (E, H, L)."""
     return {str(n): {body.name: mean(distance[:, :n, scene.rows(body.name)]) for body in scene.bodies} for n in windows}
 
 
 def mean(values: np.ndarray | jax.Array) -> float | None:
-    """Mean of all values; None where there are none."""
+    """Return the mean of all values; None where there are none."""
     return float(values.mean()) if values.size else None

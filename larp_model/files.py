@@ -14,7 +14,7 @@ from larp_model.errors import InputError
 
 @contextmanager
 def written_whole(path: str | Path) -> Iterator[IO[bytes]]:
-    """A file to write to, which takes its name, in its folder made for it, only when all went well.
+    """Open a file to write to that gets its name, in a folder made for it, only if no error is raised.
 
     The OSError of a write that fails, on a full disk say, names the path.
     """
@@ -45,7 +45,7 @@ def write_whole(path: str | Path, data: bytes) -> None:
 
 
 def require_writable(folder: str | Path, argument: str) -> None:
-    """Refuses, under the argument's name, a folder that is not there and cannot be made, or cannot be written."""
+    """Raise InputError, with the argument's name, for a folder that can be neither found nor made, or not written."""
     nearest = Path(folder).absolute()
     while not nearest.exists():
         nearest = nearest.parent

@@ -30,24 +30,24 @@ def pseudo_huber(squared: Array, limit: float) -> Array:
 
 
 def position(predicted: Array, true: Array) -> Array:
-    """Squared distance (*, L) [m^2] of the links' centres."""
+    """Return the squared distance (*, L) [m^2] of the links' centres."""
     return jnp.sum((packed.position(predicted) - packed.position(true)) ** 2, axis=-1)
 
 
 def rotation(predicted: Array, true: Array) -> Array:
-    """1 - |q . q'| (*, L)."""
+    """Return 1 - |q . q'| (*, L) of the links' orientations."""
     return 1.0 - jnp.abs(jnp.sum(packed.orientation(predicted) * packed.orientation(true), axis=-1))
 
 
 def displacement(scene: Scene, predicted: Array, morphology: Array) -> Array:
-    """Squared joint displacement (*, number of joints) [m^2]."""
+    """Return the squared joint displacement (*, number of joints) [m^2]."""
     return jnp.sum(kinematics.displacement(scene, predicted, morphology) ** 2, axis=-1)
 
 
 def total(
     scene: Scene, weights: LossWeights, emphasis: Array, predicted: Array, true: Array, morphology: Array
 ) -> tuple[Array, dict[str, Array]]:
-    """The weighted sum and its terms, averaged over states (B, H, L, 13); `emphasis` (L,) weighs the links.
+    """Return the weighted sum and its terms, means over states (B, H, L, 13); `emphasis` (L,) weighs the links.
 
     morphology (B or 1, L, 3).
     From where a sequence strays further than `LOST` it teaches nothing: that is left out, and "lost" is its share.

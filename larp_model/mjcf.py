@@ -51,14 +51,14 @@ class Placed(NamedTuple):
 
 
 class Tie(NamedTuple):
-    """Where a link is tied to its parent (3,) [m], in the middle of its hinges, and whether it is welded there."""
+    """A link's joint with its parent: its place (3,) [m], in the middle of its hinges, and whether it is welded."""
 
     place: np.ndarray
     welded: bool
 
 
 def humanoid(source: str | Path, names: Mapping[str, str] | None = None, name: str = "human") -> Body:
-    """The humanoid of an MJCF file as a human of 13 links: see above. `bodies.kicking` gives it a ball.
+    """Return the humanoid of an MJCF file as a human of 13 links: see above. `bodies.kicking` gives it a ball.
 
     It stands along z and faces x. names: what the file calls our links, {"left_shin": "calf_l", ...}; those left out
     are found by usual names. InputError where a link is missing, a joint is no hinge or ball, a geom is
@@ -86,7 +86,7 @@ def humanoid(source: str | Path, names: Mapping[str, str] | None = None, name: s
 
 
 def _named(file: str, model: mujoco.MjModel, links: Sequence[str], names: dict[str, str]) -> dict[str, int]:
-    """Which of the file's bodies, by number, each of our links is."""
+    """Return the number of the file's body that each of our links is."""
     bodies = [model.body(row).name for row in range(1, model.nbody)]
     for link in names:
         require_known("names", link, links)
@@ -101,7 +101,7 @@ def _named(file: str, model: mujoco.MjModel, links: Sequence[str], names: dict[s
 
 
 def _owners(file: str, model: mujoco.MjModel, own: Mapping[str, int]) -> dict[int, str]:
-    """Which of our links each of the file's bodies is, or rides on."""
+    """Return the link of ours that each of the file's bodies is, or is fixed to."""
     owners = {body: link for link, body in own.items()}
     for body in range(1, model.nbody):  # parents come first
         above = int(model.body_parentid[body])
@@ -114,7 +114,7 @@ def _owners(file: str, model: mujoco.MjModel, own: Mapping[str, int]) -> dict[in
 
 
 def usual_name(body: str) -> str | None:
-    """Which of our links a body of this name usually is: "R_Thigh", "thigh_right" are the "right_thigh"."""
+    """Return the link of ours that a body of this name usually is: "R_Thigh", "thigh_right" are the "right_thigh"."""
     parts = [part for part in re.split(r"[^a-z]+", re.sub(r"([a-z])([A-Z])", r"\1_\2", body).lower()) if part]
     sides = {"left": "left_", "l": "left_", "right": "right_", "r": "right_"}
     side = next((sides[part] for part in parts if part in sides), "")
@@ -125,7 +125,7 @@ def usual_name(body: str) -> str | None:
 
 
 def _placed(file: str, model: mujoco.MjModel, data: mujoco.MjData, owners: Mapping[int, str], link: str) -> Placed:
-    """What the file has of a link."""
+    """Return the bodies, geoms and joints of a link in the file."""
     rows = [body for body, owner in owners.items() if owner == link]
     ends, radii = [], []
     for geom in np.flatnonzero(np.isin(model.geom_bodyid, rows)):
@@ -144,7 +144,7 @@ def _placed(file: str, model: mujoco.MjModel, data: mujoco.MjData, owners: Mappi
 def _joints(
     file: str, model: mujoco.MjModel, data: mujoco.MjData, own: Mapping[str, int], usual: Body
 ) -> dict[str, Tie]:
-    """How each of our links, the root apart, is tied to its parent."""
+    """Return the joint of each of our links, the root apart, with its parent."""
     named = {body: link for link, body in own.items()}
     ties: dict[frozenset[str], Tie] = {}
     for body in named:
@@ -171,7 +171,7 @@ def _joints(
 
 
 def _assembled(usual: Body, placed: Sequence[Placed], ties: Mapping[str, Tie]) -> Body:
-    """The usual human with links and joints where the file has them, hanging limbs turned down first."""
+    """Return the usual human with links and joints where the file has them, hanging limbs turned down first."""
     below = {
         usual.links[joint.parent].name: link.name for link, joint in zip(usual.links[1:], usual.joints, strict=True)
     }
@@ -200,7 +200,7 @@ def _assembled(usual: Body, placed: Sequence[Placed], ties: Mapping[str, Tie]) -
 
 
 def capsule(link: Link, ends: np.ndarray, given: Placed) -> tuple[Link, np.ndarray]:
-    """The capsule along a link's axis that is as long and as voluminous as its geoms, and its centre (3,) [m].
+    """Return the capsule along a link's axis that is as long and as voluminous as its geoms, and its centre (3,) [m].
 
     ends: (G, 2, 3) of the geoms [m]. Of extent E the volume is pi r^2 E - 2 pi r^3 / 3, and grows with r up to a ball.
     """
@@ -219,7 +219,7 @@ def capsule(link: Link, ends: np.ndarray, given: Placed) -> tuple[Link, np.ndarr
 
 
 def said(link: Link, place: np.ndarray) -> tuple[float, float, float]:
-    """A place on a link, (3,) from its centre [m], as an anchor; see `scene.Joint`."""
+    """Return a place on a link, (3,) from its centre [m], as an anchor; see `scene.Joint`."""
     axis = np.array(link.axis)
     along = (place @ axis) * axis
     x, y, z = along / (0.5 * link.length) + (place - along) / link.radius

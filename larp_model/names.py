@@ -25,6 +25,6 @@ def require_file(argument: str, path: str | Path) -> None:
 
 
 def meant(name: str, names: Iterable[str]) -> str:
-    """The nearest of the names as a question; nothing where none is near."""
+    """Return the nearest of the names as a question; an empty text if none is near."""
     near = get_close_matches(str(name), list(names), n=1)
     return f"; did you mean {near[0]!r}?" if near else ""

@@ -21,7 +21,7 @@ class Statistics(NamedTuple):
 
     @staticmethod
     def of(samples: Array, weight: Array | None = None) -> Statistics:
-        """Statistics of samples (N, F), each counted by its weight (N,)."""
+        """Return the statistics of samples (N, F), each counted by its weight (N,)."""
         share = jnp.ones(samples.shape[0]) if weight is None else weight
         share = (share / share.sum())[:, None]
         mean = jnp.sum(share * samples, axis=0)
@@ -30,23 +30,23 @@ class Statistics(NamedTuple):
 
     @property
     def floored(self) -> Statistics:
-        """To normalise with: features that never vary have spread 1."""
+        """Return the statistics to normalise with: features that never vary have spread 1."""
         return self._replace(spread=jnp.where(self.spread > 1e-5, self.spread, 1.0))
 
     def beside(self, more: int) -> Statistics:
-        """The statistics with so many features more, which are left as they are."""
+        """Return the statistics with `more` features added that normalising does not change."""
         return Statistics(jnp.concatenate([self.mean, jnp.zeros(more)]), jnp.concatenate([self.spread, jnp.ones(more)]))
 
     def normalise(self, features: Array) -> Array:
-        """Features (*, F) in standard deviations from the mean."""
+        """Return features (*, F) in standard deviations from the mean."""
         return (features - self.mean) / self.spread
 
     def novelty(self, seen: Statistics) -> Array:
-        """Root mean square of features with the statistics `seen`, in standard deviations from the mean of these."""
+        """Return the root mean square of features with the statistics `seen`, in standard deviations of these ones."""
         return jnp.sqrt(jnp.mean((seen.spread**2 + (seen.mean - self.mean) ** 2) / self.spread**2))
 
     def restore(self, outputs: Array) -> Array:
-        """Outputs (*, F) in their own units."""
+        """Return outputs (*, F) in their own units."""
         return outputs * self.spread + self.mean
 
 
@@ -55,7 +55,7 @@ Measured = dict[str, tuple[Statistics, Statistics | None]]
 
 
 class Weights(NamedTuple):
-    """Everything that is learned or measured: parameters and statistics by network.
+    """Parameters and statistics of all networks of a model, by name.
 
     networks: {"dynamics/human": flax parameters, "contact/ball-human": ...}. inputs: Statistics by the same names.
     outputs: those of the networks whose outputs are changes of state.
@@ -68,7 +68,7 @@ class Weights(NamedTuple):
 
 @dataclass(frozen=True)
 class Size:
-    """Of a perceptron: how many dense layers, and how wide those before the last are.
+    """The size of a perceptron: number of dense layers, and width of those before the last.
 
     skip: residual connections. reach: inputs are held within so many standard deviations.
     """
@@ -85,7 +85,7 @@ class Size:
                 raise InputError(f"size.{field} is {value!r}, but must be an integer of at least 1")
 
     def network(self, outputs: int) -> Perceptron:
-        """The perceptron with so many outputs."""
+        """Return the perceptron with this number of outputs."""
         return Perceptron(self.layers, self.width, outputs, self.skip, self.reach)
 
 
@@ -100,7 +100,7 @@ class Perceptron(nn.Module):
 
     @nn.compact
     def __call__(self, inputs: Array) -> Array:
-        """(*, F) -> (*, outputs)."""
+        """Return outputs (*, outputs) for inputs (*, F)."""
         hidden = jnp.clip(inputs, -self.reach, self.reach)
         for index in range(self.layers - 1):
             new = jax.nn.elu(nn.Dense(self.width)(hidden))
@@ -110,18 +110,18 @@ class Perceptron(nn.Module):
 
 
 def evaluate(network: Perceptron, weights: Weights, name: str, inputs: Array) -> Array:
-    """Outputs (*, O) of a network for its inputs (*, F), normalised first."""
+    """Return outputs (*, O) of a network for its inputs (*, F), normalised first."""
     outputs = network.apply(weights.networks[name], weights.inputs[name].normalise(inputs))
     assert isinstance(outputs, jax.Array)
     return outputs
 
 
 def bounded(outputs: Array, bounds: tuple[float, ...] | float) -> Array:
-    """Outputs (*, O) within +-bounds, smoothly, and unchanged near zero."""
+    """Return outputs (*, O) within +-bounds, smoothly, and unchanged near zero."""
     limit = jnp.asarray(bounds, outputs.dtype)
     return limit * jnp.tanh(outputs / limit)
 
 
 def side_by_side(*parts: Array) -> Array:
-    """Features (B, ...) as one vector (B, F)."""
+    """Return features (B, ...) as one vector (B, F)."""
     return jnp.concatenate([part.reshape(part.shape[0], -1) for part in parts], axis=-1)

@@ -21,7 +21,7 @@ def predict(
     simulator: Simulator, states: np.ndarray, controls: np.ndarray, torques: np.ndarray, morphology: np.ndarray,
     chunk: int = 128,
 ) -> np.ndarray:  # fmt: skip
-    """States (E, H, L, 13) that the simulator predicts from states (E, L, 13), chunk by chunk.
+    """Return states (E, H, L, 13) that the simulator predicts from states (E, L, 13), chunk by chunk.
 
     What is compiled serves any H up to a multiple of `PADDED`.
     """
@@ -40,5 +40,5 @@ def predict(
 def _roll(
     model: Model, weights: Weights, start: Array, targets: Array, pushes: Array, sizes: Array, steps: Array
 ) -> Array:
-    """Compiled once for all weights of a model."""
+    """Return the rollout, compiled once for all weights of a model."""
     return Simulator.of(model, weights).rollout(start, targets, torques=pushes, morphology=sizes, steps=steps)

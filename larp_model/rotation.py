@@ -14,7 +14,7 @@ from larp_model import state as packed
 
 
 def multiply(first: Array, second: Array) -> Array:
-    """Products (*, 4) of quaternions: of rotations, the second and then the first."""
+    """Return products (*, 4) of quaternions: of rotations, the second and then the first."""
     a, b, c, d = (first[..., k] for k in range(4))
     w, x, y, z = (second[..., k] for k in range(4))
     return jnp.stack(
@@ -29,7 +29,7 @@ def multiply(first: Array, second: Array) -> Array:
 
 
 def matrix(quaternion: Array) -> Array:
-    """Rotation matrices (*, 3, 3) of quaternions (*, 4) of any length but zero."""
+    """Return rotation matrices (*, 3, 3) of quaternions (*, 4) of any length but zero."""
     w, x, y, z = (quaternion[..., k] for k in range(4))
     double = 2.0 / (w * w + x * x + y * y + z * z)
     rows = (
@@ -41,12 +41,12 @@ def matrix(quaternion: Array) -> Array:
 
 
 def conjugate(quaternion: Array) -> Array:
-    """The inverse of unit quaternions (*, 4)."""
+    """Return the inverse of unit quaternions (*, 4)."""
     return quaternion * jnp.array([1.0, -1.0, -1.0, -1.0], quaternion.dtype)
 
 
 def from_rotation_vector(vector: Array) -> Array:
-    """Unit quaternions (*, 4) of rotation vectors (*, 3) [rad]: the exponential map."""
+    """Return unit quaternions (*, 4) of rotation vectors (*, 3) [rad]: the exponential map."""
     squared = jnp.sum(vector**2, axis=-1, keepdims=True)
     small = squared < 1e-8
     angle = jnp.sqrt(jnp.where(small, 1.0, squared))
@@ -56,7 +56,7 @@ def from_rotation_vector(vector: Array) -> Array:
 
 
 def to_rotation_vector(quaternion: Array) -> Array:
-    """Rotation vectors (*, 3) [rad], at most pi long, of unit quaternions (*, 4): the logarithm."""
+    """Return rotation vectors (*, 3) [rad], at most pi long, of unit quaternions (*, 4): the logarithm."""
     quaternion = jnp.where(quaternion[..., :1] < 0.0, -quaternion, quaternion)
     real, imaginary = quaternion[..., :1], quaternion[..., 1:]
     squared = jnp.sum(imaginary**2, axis=-1, keepdims=True)
@@ -73,7 +73,7 @@ def integrate(quaternion: Array, rotation_vector: Array) -> Array:
 
 
 def heading(quaternion: Array) -> Array:
-    """Cosine and sine (*, 2) of the turn about z in orientations (*, 4) (swing-twist decomposition).
+    """Return cosine and sine (*, 2) of the turn about z in orientations (*, 4) (swing-twist decomposition).
 
     Turning an orientation about z turns its heading by the same angle. It is undefined where the body stands on its
     head; there the heading is x and its gradient zero.
@@ -88,7 +88,7 @@ def heading(quaternion: Array) -> Array:
 
 
 def course(quaternion: Array, axis: tuple[float, float, float]) -> Array:
-    """Cosine and sine (*, 2) of the direction along the ground of an axis that orientations (*, 4) turn.
+    """Return cosine and sine (*, 2) of the direction along the ground of an axis that orientations (*, 4) turn.
 
     It is undefined where the axis is upright; there it is x and its gradient zero.
     """
@@ -108,18 +108,18 @@ def about_z(vector: Array, turn: Array) -> Array:
 
 
 def opposite(turn: Array) -> Array:
-    """Cosine and sine (*, 2) of the opposite angle."""
+    """Return cosine and sine (*, 2) of the opposite angle."""
     return turn * jnp.array([1.0, -1.0], turn.dtype)
 
 
 def random_turns(key: Array, count: int) -> Array:
-    """Cosines and sines (count, 2) of uniform turns about z."""
+    """Return cosines and sines (count, 2) of uniform turns about z."""
     angle = jax.random.uniform(key, (count,), maxval=2.0 * jnp.pi)
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
 
 
 def turn_states(state: Array, turn: Array) -> Array:
-    """States (*, L, 13) turned about the world's z by `turn` (*, 2)."""
+    """Return states (*, L, 13) turned about the world's z by `turn` (*, 2)."""
     turn = turn[..., None, :]
     half = jnp.arctan2(turn[..., 1], turn[..., 0]) / 2.0
     zero = jnp.zeros_like(half)
@@ -133,7 +133,7 @@ def turn_states(state: Array, turn: Array) -> Array:
 
 
 def turned_about_z(states: np.ndarray, angle: np.ndarray | float) -> np.ndarray:
-    """NumPy's states (*, L, 13) turned about the world's z by angles (*,) [rad], in 64 bits; see `turn_states`."""
+    """Return NumPy states (*, L, 13) turned about the world's z by angles (*,) [rad], in 64 bits; see `turn_states`."""
     with jax.enable_x64(True):
         turn = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         return np.array(turn_states(jnp.asarray(states, float), jnp.asarray(turn, float)))

@@ -81,7 +81,7 @@ class Motor:
             raise InputError(f"motor.lower is {self.lower!r}, but must not exceed motor.upper {self.upper!r}")
 
     def times(self, factor: float) -> Motor:
-        """A motor so many times as strong, stiff and heavy."""
+        """Return a motor `factor` times as strong, stiff, damped and inert."""
         changed = {name: factor * getattr(self, name) for name in ("stiffness", "damping", "torque_limit", "armature")}
         return replace(self, **changed)
 
@@ -108,7 +108,7 @@ class Joint:
 
 @dataclass(frozen=True)
 class Surface:
-    """How two bodies push each other: a damped spring on their penetration r, r'' = -stiffness r - damping r'.
+    """The contact law of two bodies: a damped spring on their penetration r, r'' = -stiffness r - damping r'.
 
     stiffness: [1/s^2]. damping: [1/s]; both are per unit of effective mass, as in MuJoCo. friction: Coulomb's.
     """
@@ -124,7 +124,7 @@ class Surface:
 
     @staticmethod
     def bouncing(contact_time: float, restitution: float, friction: float) -> Surface:
-        """The surface whose free impact lasts `contact_time` [s] and returns `restitution` of the approach speed."""
+        """Return the surface whose free impact lasts `contact_time` [s] and restores `restitution` of the speed."""
         _check("surface", "contact_time", contact_time, 0.0, strict=True)
         if not 0.0 < restitution <= 1.0:
             raise InputError(f"surface.restitution is {restitution!r}, but must be in (0, 1]")
@@ -165,26 +165,26 @@ class Body:
 
     @property
     def is_ball(self) -> bool:
-        """Whether the body is one sphere, so that no direction of its frame matters."""
+        """Return whether the body is one sphere, so that no direction of its frame matters."""
         return len(self.links) == 1 and self.links[0].length == 0.0
 
     @property
     def motors(self) -> tuple[tuple[int, Joint, Motor], ...]:
-        """(child link, joint, motor) of each motorised joint."""
+        """Return (child link, joint, motor) of each motorised joint."""
         return tuple((i, j, j.motor) for i, j in enumerate(self.joints, start=1) if j.motor is not None)
 
     @property
     def sizes(self) -> np.ndarray:
-        """Length [m], radius [m] and mass [kg] of every link, (n, 3)."""
+        """Return length [m], radius [m] and mass [kg] of every link, (n, 3)."""
         return np.array([(link.length, link.radius, link.mass) for link in self.links])
 
     @property
     def weighed(self) -> float:
-        """The mass [kg] of all links times their length [m], to which motors are in proportion."""
+        """Return the mass [kg] of all links times their length [m], to which motors are in proportion."""
         return sum(link.mass for link in self.links) * sum(link.length for link in self.links)
 
     def sized(self, sizes: np.ndarray) -> Body:
-        """The body with links of these lengths [m], radii [m] and masses [kg], (n, 3), and motors in proportion."""
+        """Return the body with links of these lengths [m], radii [m], masses [kg], (n, 3), and motors in proportion."""
         links = tuple(
             replace(link, length=length, radius=radius, mass=mass)
             for link, (length, radius, mass) in zip(self.links, np.asarray(sizes, float).tolist(), strict=True)
@@ -199,14 +199,14 @@ class Body:
         return replace(larger, joints=tuple(joints))
 
     def link(self, name: str) -> int:
-        """Index of a link by name."""
+        """Return the index of a link by name."""
         for index, link in enumerate(self.links):
             if link.name == name:
                 return index
         raise InputError(f"body {self.name!r} has no link {name!r}; it has {[link.name for link in self.links]}")
 
     def tied(self, one: str, other: str) -> bool:
-        """Whether two links are the same, or one is the other's parent."""
+        """Return whether two links are the same, or one is the other's parent."""
         near, far = sorted((self.link(one), self.link(other)))
         return near == far or self.joints[far - 1].parent == near
 
@@ -226,11 +226,11 @@ class Pair:
 
     @property
     def of_itself(self) -> bool:
-        """Whether a body touches itself."""
+        """Return whether a body touches itself."""
         return self.first == self.second
 
     def flipped(self) -> Pair:
-        """The same pair, its bodies named the other way round."""
+        """Return the same pair with its bodies in the other order."""
         return Pair(self.second, self.first, self.second_links, self.first_links, self.surface)
 
 
@@ -266,22 +266,22 @@ class Scene:
                     )
 
     def body(self, name: str) -> Body:
-        """The body of that name."""
+        """Return the body of that name."""
         for body in self.bodies:
             if body.name == name:
                 return body
         raise InputError(f"scene has no body {name!r}; it has {[body.name for body in self.bodies]}")
 
     def rows(self, name: str) -> slice:
-        """The rows of a body in the state."""
+        """Return the rows of a body in the state."""
         return self._slice(name, lambda body: len(body.links))
 
     def joint_rows(self, name: str) -> slice:
-        """The rows of a body's joints among all joints."""
+        """Return the rows of a body's joints among all joints."""
         return self._slice(name, lambda body: len(body.joints))
 
     def motor_rows(self, name: str) -> slice:
-        """The rows of a body in the control."""
+        """Return the rows of a body in the control."""
         return self._slice(name, lambda body: len(body.motors))
 
     def _slice(self, name: str, count: Callable[[Body], int]) -> slice:
@@ -291,33 +291,33 @@ class Scene:
         return slice(start, start + count(body))
 
     def index(self, body: str, link: str) -> int:
-        """The row of a link in the state."""
+        """Return the row of a link in the state."""
         return self.rows(body).start + self.body(body).link(link)
 
     @property
     def links(self) -> tuple[Link, ...]:
-        """All links, in the order of the state."""
+        """Return all links, in the order of the state."""
         return tuple(link for body in self.bodies for link in body.links)
 
     @property
     def morphology(self) -> np.ndarray:
-        """Length [m], radius [m] and mass [kg] of every link, (L, 3)."""
+        """Return length [m], radius [m] and mass [kg] of every link, (L, 3)."""
         return np.array([(link.length, link.radius, link.mass) for link in self.links], np.float32)
 
     @property
     def motors(self) -> tuple[Motor, ...]:
-        """All motors, in the order of the control."""
+        """Return all motors, in the order of the control."""
         return tuple(motor for body in self.bodies for _, _, motor in body.motors)
 
     def joints(self) -> Iterator[tuple[int, int, Joint]]:
-        """(row of the child, row of the parent, joint) for every joint."""
+        """Yield (row of the child, row of the parent, joint) for every joint."""
         for body in self.bodies:
             start = self.rows(body.name).start
             for child, joint in enumerate(body.joints, start=1):
                 yield start + child, start + joint.parent, joint
 
     def sized(self, morphology: np.ndarray) -> Scene:
-        """The scene with links of these lengths [m], radii [m] and masses [kg], (L, 3): see `Body.sized`."""
+        """Return the scene with links of these lengths [m], radii [m] and masses [kg], (L, 3): see `Body.sized`."""
         sizes = np.asarray(morphology, float)
         if sizes.shape != (len(self.links), 3):
             raise InputError(f"morphology has shape {sizes.shape}, but needs ({len(self.links)}, 3)")
@@ -325,22 +325,22 @@ class Scene:
 
     @property
     def between(self) -> Scene:
-        """The scene with contacts of different bodies alone."""
+        """Return the scene with contacts of different bodies alone."""
         return replace(self, pairs=tuple(pair for pair in self.pairs if not pair.of_itself))
 
     @property
     def within(self) -> Scene:
-        """The scene with contacts of bodies with themselves alone."""
+        """Return the scene with contacts of bodies with themselves alone."""
         return replace(self, pairs=tuple(pair for pair in self.pairs if pair.of_itself))
 
     def only(self, *names: str) -> Scene:
-        """The scene with these bodies alone."""
+        """Return the scene with these bodies alone."""
         pairs = tuple(p for p in self.pairs if p.first in names and p.second in names)
         return Scene(tuple(self.body(name) for name in names), pairs, self.dt, self.gravity)
 
 
 def anchor(point: Vector, length: np.ndarray, radius: np.ndarray, axis: Vector) -> np.ndarray:
-    """A joint anchor in its link's frame [m], (*, 3), for links of `length` and `radius` (*,) [m]."""
+    """Return a joint anchor in its link's frame [m], (*, 3), for links of `length` and `radius` (*,) [m]."""
     direction, offset = np.asarray(axis), np.asarray(point)
     along = offset @ direction * direction
     return 0.5 * length[..., None] * along + radius[..., None] * (offset - along)

@@ -53,7 +53,7 @@ class Simulator:
     weights: Weights
     scene: Scene
     morphology: Array | np.ndarray
-    """Of the scene, (L, 3)."""
+    """Sizes of the scene's links, (L, 3)."""
 
     differentiable = True
 
@@ -89,7 +89,7 @@ class Simulator:
         self, state: ArrayLike, control: ArrayLike, torque: ArrayLike | None = None,
         morphology: ArrayLike | None = None,
     ) -> Array:  # fmt: skip
-        """States (N, L, 13) after one `scene.dt` under controls (N, J, 3) [rad]; see `rollout` for the rest."""
+        """Return states (N, L, 13) after one `scene.dt` under controls (N, J, 3) [rad]; see `rollout` for the rest."""
         given = self._checked(state, control, torque, morphology, ())
         return given[0] if given[0].shape[0] == 0 else _step(self.model, self.weights, *given)
 
@@ -97,7 +97,7 @@ class Simulator:
         self, state: ArrayLike, controls: ArrayLike, torques: ArrayLike | None = None,
         morphology: ArrayLike | None = None, steps: ArrayLike | None = None,
     ) -> Array:  # fmt: skip
-        """States (N, H, L, 13) after each of H steps from states (N, L, 13) under controls (N, H, J, 3) [rad].
+        """Return states (N, H, L, 13) after each of H steps from states (N, L, 13) under controls (N, H, J, 3) [rad].
 
         From where a trajectory diverges it holds NaN: see `state.healthy`.
 
@@ -117,7 +117,7 @@ class Simulator:
         self, state: ArrayLike, control: ArrayLike, torque: ArrayLike | None, morphology: ArrayLike | None,
         steps: tuple[int, ...],
     ) -> tuple[Array, Array, Array | None, Array]:  # fmt: skip
-        """The public arguments as JAX arrays, refused by name where they do not fit; steps: (H,) or none."""
+        """Return the public arguments as JAX arrays; raise InputError where one does not fit. steps: (H,) or none."""
         start, links, motors = _array("state", state), len(self.scene.links), len(self.scene.motors)
         if start.ndim != 3 or start.shape[1:] != (links, packed.SIZE):
             raise InputError(f"state has shape {start.shape}, but needs (N, {links}, {packed.SIZE})")
@@ -148,7 +148,7 @@ def rollout(
     model: Model, weights: Weights, state: Array, controls: Array, torques: Array | None = None,
     morphology: Array | None = None, steps: Array | None = None, stop_gradient: bool = False,
 ) -> Array:  # fmt: skip
-    """States (B, H, L, 13) after each of H steps; the arguments are those of `step`, with a time axis second.
+    """Return states (B, H, L, 13) after each of H steps; the arguments are those of `step`, with a time axis second.
 
     steps (): so many of the H are computed, the rest repeat the last; all by default.
     """

@@ -22,32 +22,32 @@ LIMITS = ((VELOCITY, 1e2), (ANGULAR_VELOCITY, 1e3))
 
 
 def position(state: Array) -> Array:
-    """(*, L, 3) [m], world frame."""
+    """Return positions (*, L, 3) [m], world frame, of the centres of mass."""
     return state[..., POSITION]
 
 
 def orientation(state: Array) -> Array:
-    """(*, L, 4) quaternion w, x, y, z from the link to the world."""
+    """Return orientations (*, L, 4): quaternions w, x, y, z from the link to the world."""
     return state[..., ORIENTATION]
 
 
 def velocity(state: Array) -> Array:
-    """(*, L, 3) [m/s], world frame, of the centre of mass."""
+    """Return velocities (*, L, 3) [m/s], world frame, of the centre of mass."""
     return state[..., VELOCITY]
 
 
 def angular_velocity(state: Array) -> Array:
-    """(*, L, 3) [rad/s], world frame."""
+    """Return angular velocities (*, L, 3) [rad/s], world frame."""
     return state[..., ANGULAR_VELOCITY]
 
 
 def pack(position: Array, orientation: Array, velocity: Array, angular_velocity: Array) -> Array:
-    """The state (*, L, 13) of its four parts."""
+    """Return the state (*, L, 13) of its four parts."""
     return jnp.concatenate([position, orientation, velocity, angular_velocity], axis=-1)
 
 
 def healthy(state: Any) -> Any:
-    """(*,) whether all links of states (*, L, 13), of NumPy or JAX, are finite and within `LIMITS`."""
+    """Return (*,) whether all links of states (*, L, 13), of NumPy or JAX, are finite and within `LIMITS`."""
     xp = state.__array_namespace__()
     found = xp.all(xp.isfinite(state), axis=(-2, -1))
     for columns, limit in LIMITS:
@@ -56,13 +56,20 @@ def healthy(state: Any) -> Any:
 
 
 class Trajectories(Protocol):
-    """Recorded truth: see `truth.episodes.Episodes`."""
+    """Recorded ground truth: see `engines.episodes.Episodes`."""
 
     @property
-    def states(self) -> np.ndarray: ...
+    def states(self) -> np.ndarray:
+        """Return states (E, T + 1, L, 13)."""
+
     @property
-    def controls(self) -> np.ndarray: ...
+    def controls(self) -> np.ndarray:
+        """Return joint targets (E, T, J, 3) [rad]."""
+
     @property
-    def torques(self) -> np.ndarray: ...
+    def torques(self) -> np.ndarray:
+        """Return external torques (E, T, L, 3) [N m]."""
+
     @property
-    def morphology(self) -> np.ndarray: ...
+    def morphology(self) -> np.ndarray:
+        """Return sizes (E, L, 3)."""

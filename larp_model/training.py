@@ -39,7 +39,7 @@ TIMED = 20
 
 @dataclass(frozen=True)
 class Recipe:
-    """How to train.
+    """Settings of a training run.
 
     curriculum: (unroll in steps, share of the updates) in order. learning_rate falls to `final` of itself by a cosine.
     clip: largest gradient norm. drop: norm beyond which a batch is dropped. contact_share: windows that start from
@@ -68,7 +68,7 @@ class Recipe:
             raise InputError(f"recipe.curriculum is {self.curriculum!r}, but its shares must sum to 1")
 
     def unroll(self, update: int) -> int:
-        """Steps unrolled at an update."""
+        """Return the number of steps unrolled at an update."""
         done = 0.0
         for steps, share in self.curriculum:
             done += share * self.updates
@@ -78,7 +78,7 @@ class Recipe:
 
 
 class Progressed(NamedTuple):
-    """What training carries, and what a checkpoint holds."""
+    """The state of training, which a checkpoint holds."""
 
     networks: dict[str, Any]
     optimiser: Any
@@ -104,7 +104,7 @@ class Windows:
         self.contacts = [first_contacts(scene.between, source) for source in self.sources]
 
     def draw(self, random: np.random.Generator, steps: int) -> Batch:
-        """Windows of so many steps."""
+        """Return windows of so many steps."""
         counts = random.multinomial(self.recipe.batch, self.share)
         parts = []
         for source, contacts, count in zip(self.sources, self.contacts, counts, strict=True):
@@ -133,7 +133,7 @@ class Windows:
 
 
 def statistics_of(model: Model, windows: Windows, random: np.random.Generator, batches: int = 32) -> Weights:
-    """Fresh weights, their statistics measured on single true steps drawn as in training."""
+    """Return fresh weights, their statistics measured on single true steps drawn as in training."""
     drawn = [windows.draw(random, 2) for _ in range(batches)]
     states, controls, torques, morphology = (np.concatenate(column) for column in zip(*drawn, strict=True))
     turns = rotation.random_turns(jax.random.key(int(random.integers(2**31))), len(states))
@@ -145,18 +145,18 @@ def statistics_of(model: Model, windows: Windows, random: np.random.Generator, b
 
 
 def emphasis(scene: Scene, recipe: Recipe) -> Array:
-    """Weight (L,) of each link in the loss."""
+    """Return the weight (L,) of each link in the loss."""
     factors = dict(recipe.emphasis)
     return jnp.array([factors.get(body.name, 1.0) for body in scene.bodies for _ in body.links], jnp.float32)
 
 
 def optimiser(recipe: Recipe) -> optax.GradientTransformation:
-    """Adam behind a clipped gradient norm; its changes are still to be multiplied by a rate."""
+    """Return Adam behind a clipped gradient norm; its changes are still to be multiplied by a rate."""
     return optax.chain(optax.clip_by_global_norm(recipe.clip), optax.scale_by_adam())
 
 
 def learning_rate(recipe: Recipe, update: int) -> float:
-    """Of an update: rises for a while, then falls on a cosine."""
+    """Return the learning rate of an update: it rises for a while, then falls on a cosine."""
     warm = min(500, recipe.updates // 10 + 1)
     if update < warm:
         return recipe.learning_rate * update / warm

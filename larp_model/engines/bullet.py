@@ -43,14 +43,14 @@ DIVISIONS = 64  # of an engine step, at most: a surface without damping would as
 
 
 class Give(NamedTuple):
-    """How a surface gives way in Bullet. stiffness: [N/m]. damping: [N s/m]."""
+    """The compliance of a surface in Bullet. stiffness: [N/m]. damping: [N s/m]."""
 
     stiffness: float
     damping: float
 
 
 def give(surface: Surface, mass: float, step: float) -> Give:
-    """The spring and damper whose free contact, in implicit steps of `step` [s], follows the surface's exactly.
+    """Return the spring and damper whose free contact, in implicit steps of `step` [s], follows the surface's exactly.
 
     An implicit step of v' = -k x - c v, c = damping + k step, multiplies states by a matrix of determinant b and of
     trace 1 + b - k b step^2 / mass, b = 1 / (1 + c step / mass); both are known of the exact motion.
@@ -64,7 +64,7 @@ def give(surface: Surface, mass: float, step: float) -> Give:
 
 
 def inertia(link: Link) -> np.ndarray:
-    """(3,) moments of a capsule of uniform density [kg m^2]: twice across its axis, then along it."""
+    """Return moments of inertia (3,) of a capsule of uniform density [kg m^2]: twice across its axis, then along it."""
     length, radius = link.length, link.radius
     cylinder = link.mass * length / (length + 4.0 / 3.0 * radius)
     caps = link.mass - cylinder
@@ -74,7 +74,7 @@ def inertia(link: Link) -> np.ndarray:
 
 
 def _principal(link: Link) -> np.ndarray:
-    """(3, 3) from a frame whose z lies along the capsule to the link's frame."""
+    """Return the rotation (3, 3) from a frame whose z lies along the capsule to the link's frame."""
     axis = np.asarray(link.axis)
     across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     across /= np.linalg.norm(across)
@@ -82,7 +82,7 @@ def _principal(link: Link) -> np.ndarray:
 
 
 def _divisions(surface: Surface, step: float) -> int:
-    """Into how many parts an engine step of `step` [s] is divided, so that a damper can make up for them."""
+    """Return into how many parts an engine step of `step` [s] is divided, so that a damper can make up for them."""
     enough = (count for count in range(1, DIVISIONS) if give(surface, 1.0, step / count).damping >= 0.0)
     return next(enough, DIVISIONS)
 
@@ -128,7 +128,7 @@ def _tree(scene: Scene, body: Body, soft: bool) -> _Tree:
 
 
 def _soft_bodies(scene: Scene) -> set[str]:
-    """Names of the bodies that carry the surface of their contacts: the lighter one of each pair."""
+    """Return the names of the bodies that carry the surface of their contacts: the lighter one of each pair."""
     masses = {body.name: sum(link.mass for link in body.links) for body in scene.bodies}
     lighter = {pair: min(pair.second, pair.first, key=masses.__getitem__) for pair in scene.pairs}
     soft = set(lighter.values())
@@ -241,7 +241,7 @@ class _World:
         return int(index)
 
     def _touch(self, index: int, link: int, friction: float, stiffness: float, damping: float) -> None:
-        """How a link slides and gives way; it meets nothing but what is named."""
+        """Set a link's friction and compliance, and let it collide with what is named alone."""
         self.call("setCollisionFilterGroupMask", index, link, 0, 0)
         self.call(
             "changeDynamics",
@@ -254,7 +254,7 @@ class _World:
         )
 
     def state(self) -> np.ndarray:
-        """The packed state (L, 13)."""
+        """Return the packed state (L, 13)."""
         parts = []
         for tree, index in zip(self._trees, self._bodies, strict=True):
             pose, motion = self.call("getBasePositionAndOrientation", index), self.call("getBaseVelocity", index)
@@ -321,7 +321,7 @@ def _anchor(link: Link, point: Vector) -> np.ndarray:
 
 
 def _rotation_vector(quaternion: np.ndarray) -> np.ndarray:
-    """(*, 3) [rad] of quaternions (*, 4) x, y, z, w: SciPy's way takes longer than the engine's step."""
+    """Return rotation vectors (*, 3) [rad] of quaternions (*, 4) x, y, z, w; SciPy takes longer than a step."""
     vector, scalar = quaternion[:, :3], quaternion[:, 3:]
     size = np.sqrt((vector * vector).sum(axis=1, keepdims=True))
     angle = 2.0 * np.arctan2(size, np.abs(scalar))
@@ -369,11 +369,11 @@ class BulletTruth:
 
     @property
     def batch(self) -> int:
-        """How many simulations are kept."""
+        """Return the number of simulations."""
         return len(self._worlds)
 
     def state(self) -> np.ndarray:
-        """The packed states (N, L, 13); of the two quaternions of an orientation, that with w >= 0."""
+        """Return the packed states (N, L, 13); of the two quaternions of an orientation, that with w >= 0."""
         return np.stack([world.state() for world in self._worlds])
 
     def reset(self, states: np.ndarray) -> None:

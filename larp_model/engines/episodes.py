@@ -32,7 +32,7 @@ class Episodes(NamedTuple):
 
     @property
     def steps(self) -> int:
-        """T, the steps of each episode."""
+        """Return T, the steps of each episode."""
         return int(self.controls.shape[1])
 
 
@@ -43,7 +43,7 @@ def record(
     torques: np.ndarray | None = None,
     morphology: np.ndarray | None = None,
 ) -> tuple[Episodes, int]:
-    """Roll out any number of controls (E, T, J, 3) from states (E, L, 13); returns the episodes and how many diverged.
+    """Roll out any number of controls (E, T, J, 3) from states (E, L, 13); return the episodes and how many diverged.
 
     morphology: (E, L, 3); the scene's by default. Diverged trajectories are dropped.
     """
@@ -73,7 +73,7 @@ def record(
 
 
 def join(parts: Sequence[Episodes]) -> Episodes:
-    """Several recordings of the same scene and length as one."""
+    """Return several recordings of the same scene and length as one."""
     return Episodes(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 

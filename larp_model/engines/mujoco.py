@@ -27,7 +27,7 @@ FARTHEST = 1e3
 
 
 def compile_model(scene: Scene, substeps: int = SUBSTEPS) -> mujoco.MjModel:
-    """The MuJoCo model of a scene, its sensors laid out as the packed state."""
+    """Return the MuJoCo model of a scene, its sensors laid out as the packed state."""
     if substeps < 1:
         raise InputError(f"substeps is {substeps!r}, but must be at least 1")
     spec = mujoco.MjSpec()
@@ -99,7 +99,7 @@ def _add_pair(spec: mujoco.MjSpec, first: str, second: str, surface: Surface) ->
 
 
 def cores() -> int:
-    """How many processors this process may use; the engine's own default counts those that it may not, too."""
+    """Return how many processors this process may use; the engine's default counts all of the machine's."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -145,15 +145,15 @@ class Truth:
 
     @property
     def batch(self) -> int:
-        """How many simulations run side by side."""
+        """Return how many simulations run side by side."""
         return int(self._batch.nsim)
 
     def state(self) -> np.ndarray:
-        """The packed states (N, L, 13)."""
+        """Return the packed states (N, L, 13)."""
         return np.array(self._sensors).reshape(self.batch, -1, packed.SIZE)
 
     def coordinates(self) -> tuple[np.ndarray, np.ndarray]:
-        """MuJoCo's own positions (N, nq) and velocities (N, nv), for engines that read its models."""
+        """Return MuJoCo's own positions (N, nq) and velocities (N, nv), for engines that read its models."""
         return np.array(self._batch.bind("qpos")), np.array(self._batch.bind("qvel"))
 
     def reset(self, states: np.ndarray) -> None:
@@ -214,7 +214,7 @@ class Truth:
 
 
 def closed(scene: Scene, states: np.ndarray, morphology: np.ndarray | None = None) -> np.ndarray:
-    """States (N, L, 13) whose joints come together: links that are not roots are put where their joints hold them.
+    """Return states (N, L, 13) whose joints are closed: links that are not roots are put where their joints hold them.
 
     morphology: (N, L, 3); the scene's by default.
     """
@@ -240,6 +240,6 @@ def closed(scene: Scene, states: np.ndarray, morphology: np.ndarray | None = Non
 
 
 def finite(states: np.ndarray) -> np.ndarray:
-    """(N,) which of the trajectories (N, H, L, 13) stayed finite and within physical limits."""
+    """Return (N,) which of the trajectories (N, H, L, 13) stayed finite and within physical limits."""
     near = (np.abs(states[..., packed.POSITION]) < FARTHEST).all(axis=(1, 2, 3))
     return near & packed.healthy(states).all(axis=1)

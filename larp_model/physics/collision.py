@@ -1,4 +1,4 @@
-"""Where capsules are closest, when they touch within a step, and which links of a scene can.
+"""Collision of capsules: closest points, time of impact, and the pairs of links that can touch in a step.
 
 A ball is a capsule of length 0, so one description serves all pairs of links. Values and gradients stay finite for
 coincident, parallel and zero-length axes. Arrays have the batch last, as in `linalg`.
@@ -124,7 +124,7 @@ class ContactSettings:
 
 
 class Rates(NamedTuple):
-    """How the links of a scene accelerate in a step in which no other link touches them, (L, 3, B) each.
+    """Accelerations of the links of a scene in a step in which no other link touches them, (L, 3, B) each.
 
     acceleration [m/s^2], angular_acceleration [rad/s^2]: mean ones, which change by jerk, angular_jerk [m/s^3,
     rad/s^3]. uncounted, uncounted_angular: parts of them that contacts do not count, see `motion.velocity_products`.

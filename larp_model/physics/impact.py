@@ -58,7 +58,7 @@ class SideStates(NamedTuple):
 
 
 Spread = dict[str, tuple[list[int], tuple[Array, Array]]]
-"""Of articulated bodies by name: which sides they may be, and what their links gain by impulses there."""
+"""By articulated body: the sides that it may be, and the velocities that its links gain by impulses there."""
 
 Totals = tuple[tuple[Array, Array], tuple[Array, Array]]
 """Impulses and moments (2, S, 3, B), kept and fading: what is there at the end of the step, and summed over time."""
