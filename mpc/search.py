@@ -120,7 +120,7 @@ def best_first(knots: np.ndarray, costs: np.ndarray, count: int | None) -> tuple
 
 
 def distinct(knots: np.ndarray) -> np.ndarray:
-    """Return the rows of knots (N, K, J, 3) that are not copies of an earlier one, in their order."""
+    """Return the numbers (M,) of the knots (N, K, J, 3) that are not copies of an earlier one, in their order."""
     first: dict[bytes, int] = {}
     for row, each in enumerate(knots):
         first.setdefault(each.tobytes(), row)

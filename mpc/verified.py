@@ -97,7 +97,10 @@ class Verified:
 
     @staticmethod
     def corrected(best: Trial, problem: Problem) -> Problem:
-        """Return the problem with residuals right for the best candidate; the same one where the planner's are lost."""
+        """Return the problem with residuals right for the best candidate.
+
+        It is the same one where the candidate is lost in the planner's own dynamics, or in the truer ones.
+        """
         if not np.isfinite(best.cost):
             return problem
         believed = problem.tries(best.knots[None])
