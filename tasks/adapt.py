@@ -1,7 +1,7 @@
-"""Ten minutes for yours: a network that corrects physics for a motion and a body of the user's own.
+"""Training, in about ten minutes, of a network that corrects physics for a motion and a body of the user's own.
 
-Truth around that motion and body and of what the planner tries there, training, and a check on episodes that neither
-saw, before and after. What is written is the better of both.
+The network is trained on ground-truth episodes around that motion and body and on rollouts of the planner's candidates
+there. Physics alone and the trained network are checked on the same held-out episodes; the better one is written.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ from tasks.tried import tried_episodes
 
 # Episodes that weights are checked on, and those drawn at a time.
 HELD_OUT, DRAWN = 64, 256
-# Shares of the time: random truth, and what the planner tries.
+# Shares of the time: random episodes, and rollouts of the planner's candidates.
 TRUTH, PLANS = 0.15, 0.2
-# Of each plan so many of what it tried, and more kicks than are planned in any time.
+# Rollouts taken from each plan, and more kicks than are planned in any time.
 TRIED, KICKS = 128, 1000
 # The check at the end [s], and the least that is worth beginning [min].
 CHECKING, LEAST = 20.0, 2.0
@@ -48,7 +48,7 @@ MOST = 1_000_000
 
 
 class Checked(NamedTuple):
-    """Weights on episodes that they were not trained on: errors [m] of the human over `WINDOWS`, and of the launch.
+    """Errors of weights on held-out episodes: of the human over `WINDOWS` [m], and of the launch.
 
     launch: median relative error from the true state at first contact; NaN where nothing was struck.
     """
@@ -57,14 +57,14 @@ class Checked(NamedTuple):
     launch: float
 
     def better_than(self, other: Checked) -> bool:
-        """Whether errors are smaller on the whole: by the mean of their logarithms."""
+        """Return whether errors are smaller on the whole: by the mean of their logarithms."""
         pairs = [*zip(self.human, other.human, strict=True), (self.launch, other.launch)]
         steps = [math.log(max(mine, 1e-6) / max(its, 1e-6)) for mine, its in pairs if mine + its == mine + its]
         return sum(steps) < 0.0
 
 
 def check(model: Model, weights: Weights, episodes: Episodes) -> Checked:
-    """What weights are worth; infinite where all predictions diverge."""
+    """Return the errors of weights on episodes; the human's are infinite where all predictions diverge."""
     found = evaluation.evaluate(Simulator.of(model, weights), episodes, WINDOWS)
     human = tuple(math.inf if (error := found["windows"][str(n)]["human"]) is None else error for n in WINDOWS)
     return Checked(human, found["launch"]["0"].get("relative_error", {}).get("median", math.nan))
@@ -142,13 +142,13 @@ def main(
 
 
 def described(found: Checked) -> str:
-    """In a few words."""
+    """Return the errors in a few words: of the human [mm], of the launch [%]."""
     human = " / ".join(f"{1000.0 * error:.1f}" for error in found.human)
     return f"human {human} mm over {' / '.join(map(str, WINDOWS))} steps, launch {100.0 * found.launch:.0f} %"
 
 
 def cli() -> None:
-    """The command `larp-adapt`."""
+    """Run the command `larp-adapt`."""
     run(main)
 
 

@@ -1,4 +1,4 @@
-"""What every command here has in common: its line, what it tells while it works, and what it remembers."""
+"""Parts that all commands share: the command line, progress output, and JAX with its compilation cache."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from larp_model.errors import InputError
 from larp_model.runtime import remember_compilations, require_device
 from mpc.loop import DivergenceError
 
-# What a write fails with on a disk that takes no more.
+# Error numbers of a write to a disk that is full or read-only.
 DISK = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS}
 
 
 def run(task: Callable[..., None] | dict[str, Callable[..., None]], arguments: list[str] | None = None) -> None:
     """Run the command line of a task, or of several by name, and end the process as its user expects.
 
-    One line on stderr and exit code 2 for input that cannot be used, 1 where a disk takes no more, the world
-    diverged or stdout could not be written; 130 after Ctrl-C. Any other exception is a defect and keeps its traceback.
-    A command outlives who reads its output: see `Stream`.
+    An error is one line on stderr, with exit code 2 for input that cannot be used, 1 where a disk is full or read-only,
+    the world diverged or stdout could not be written, and 130 after Ctrl-C. Any other exception is a defect and keeps
+    its traceback. A command goes on when the reader of its output ends: see `Stream`.
     """
     out, err = Stream(sys.stdout), Stream(sys.stderr)
     with redirect_stdout(out), redirect_stderr(err), _interruptible():  # type: ignore[type-var]
@@ -66,7 +66,7 @@ def run(task: Callable[..., None] | dict[str, Callable[..., None]], arguments: l
 def _interruptible() -> Iterator[None]:
     """Raise Ctrl-C again where it came while JAX collected garbage: exceptions raised there are dropped.
 
-    Where it came in a callback of a compiled program, JAX logs its traceback; not here.
+    Where it came in a callback of a compiled program, JAX would log its traceback; that log record is suppressed.
     """
     before, logger = sys.unraisablehook, logging.getLogger("jax._src.callback")
 
@@ -97,7 +97,7 @@ def _end(code: int, reason: str) -> NoReturn:
 
 
 def prepare_jax() -> None:
-    """Get JAX ready for a command, once its arguments are checked: a device that exists, a kept compilation cache."""
+    """Prepare JAX once arguments are checked: require a device that exists, enable the compilation cache."""
     require_device()
     remember_compilations()
 
@@ -110,7 +110,7 @@ class Stream(io.TextIOBase):
     """
 
     def __init__(self, stream: TextIO | None) -> None:
-        """stream: None where the process was started without one."""
+        """Wrap a stream; None, where the process was started without one, stands for the null device."""
         self._stream = stream if stream is not None else open(os.devnull, "w")  # noqa: SIM115 as long as the process
         self.failure: OSError | None = None
         if isinstance(self._stream, io.TextIOWrapper):
@@ -118,7 +118,7 @@ class Stream(io.TextIOBase):
 
     @property
     def encoding(self) -> str:  # type: ignore[override]
-        """The terminal's."""
+        """Return the encoding of the wrapped stream."""
         return self._stream.encoding
 
     def write(self, text: str) -> int:
@@ -135,7 +135,7 @@ class Stream(io.TextIOBase):
         return self._stream.isatty()
 
     def fileno(self) -> int:
-        """The file descriptor."""
+        """Return the file descriptor of the wrapped stream."""
         return self._stream.fileno()
 
     def _try(self, action: Callable[[], object]) -> None:
@@ -151,19 +151,22 @@ class Stream(io.TextIOBase):
 
 
 class Teller:
-    """Says what a command is at, and how long each part took."""
+    """Printer of a command's progress, of the time that each part took, and of its result."""
 
     def __init__(self, quiet: bool = False, json: bool = False) -> None:
-        """json: results are JSON on stdout, and all else goes to stderr."""
+        """Set where output goes.
+
+        quiet: print nothing but JSON results. json: print results as JSON on stdout, and all else on stderr.
+        """
         self._json, self._console = json, Console(quiet=quiet, stderr=json, highlight=False)
 
     def __call__(self, what: str) -> None:
-        """Say a line."""
+        """Print a line."""
         self._console.print(what)
 
     @contextmanager
     def part(self, what: str) -> Iterator[None]:
-        """Say that a part begins and, when it ends, how long it took."""
+        """Print that a part begins and, when it ends, how long it took."""
         begin = time.perf_counter()
         self._console.print(f"{what} ...", end=" ")
         try:
@@ -175,7 +178,7 @@ class Teller:
 
     @contextmanager
     def bar(self, what: str) -> Iterator[Callable[[int, int], None]]:
-        """Show how far a part is and how long it still takes; to be told how much is done, of how much."""
+        """Show a progress bar with the remaining time; yields a function to call with what is done and the whole."""
         with Progress(
             TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=self._console
         ) as progress:

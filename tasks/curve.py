@@ -1,4 +1,4 @@
-"""The training so far as a picture: losses over updates, stage after stage."""
+"""Picture of the training so far: losses over updates, stage after stage."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ COLOURS = ("#000000", "#0072B2", "#9aa3ad")
 
 
 def history(folder: Path) -> list[dict[str, float]]:
-    """What a stage's training has logged every hundred updates; of what a run did again, the last counts."""
+    """Return the rows that a stage's training logged every hundred updates; of a repeated update, the last one."""
     path = folder / "history.jsonl"
     rows = [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
     return [row for _, row in sorted({row["update"]: row for row in rows}.items())]

@@ -1,4 +1,4 @@
-"""Truth episodes around the reference kick: what the learned simulator is trained and judged on."""
+"""Ground-truth episodes around the reference kick, on which the learned simulator is trained and evaluated."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tasks.motions.people import random_people
 from tasks.motions.references import Reference, clearance, resting
 
 STEPS = 70
-# How far random joint targets stray from the reference, standard deviation by segment [rad]; the planner's too.
+# Deviation of random joint targets from the reference, standard deviation by segment [rad]; the planner's too.
 STRAY = {
     "abdomen": 0.08,
     "torso": 0.15,
@@ -51,7 +51,7 @@ WINDOWS = (10, 38, 60)
 
 
 def stray(scene: Scene) -> np.ndarray:
-    """`STRAY` of every motor and axis (J, 3) [rad]; none where the motor does not turn."""
+    """Return `STRAY` of every motor and axis (J, 3) [rad]; a fifth of it on axes whose range is 0.45 rad or less."""
     rows = []
     for body in scene.bodies:
         for child, _, motor in body.motors:
@@ -61,7 +61,7 @@ def stray(scene: Scene) -> np.ndarray:
 
 
 def smooth_noise(random: np.random.Generator, count: int, steps: int, knots: int, scale: np.ndarray) -> np.ndarray:
-    """Random walks (count, steps, J, 3) through `knots` random values of standard deviation `scale` (J, 3)."""
+    """Return smooth noise (count, steps, J, 3): splines through `knots` normal values of deviation `scale` (J, 3)."""
     values = random.standard_normal((count, knots, *scale.shape)) * scale
     return CubicSpline(np.linspace(0.0, 1.0, knots), values, axis=1)(np.linspace(0.0, 1.0, steps))
 
@@ -70,10 +70,10 @@ def random_starts(
     random: np.random.Generator, scene: Scene, reference: Reference, count: int, steps: int,
     sizes: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """States (count, L, 13) along the reference, disturbed and turned about z, and the steps (count,) they come from.
+    """Return states (count, L, 13) of the reference, disturbed and turned about z, and their steps (count,) in it.
 
-    What the human may strike, if anything, waits where a foot will pass, or near the ball's spot, or comes from
-    anywhere. sizes: (count, L, 3) of other bodies, who are as far above the ground as the reference is.
+    The link that the human may strike, if any, rests where a foot will pass or near the ball's spot, or comes from
+    anywhere. sizes: (count, L, 3) of other bodies, placed as far above the ground as the reference is.
     """
     latest = len(reference.controls) - steps - 1
     from_start = random.random(count) < 0.5
@@ -111,9 +111,9 @@ def random_starts(
 def random_places(
     random: np.random.Generator, link: Link, spot: np.ndarray, paths: np.ndarray, dt: float
 ) -> np.ndarray:
-    """States (count, 13) of a link that a human may strike whose feet go along paths (count, steps, 3) [m].
+    """Return random states (count, 13) of a link that a human may strike with a foot on paths (count, steps, 3) [m].
 
-    It waits near the spot (2,) or (count, 2) [m], or where the foot will pass, or comes from anywhere.
+    The link rests near the spot (2,) or (count, 2) [m] or where the foot will pass, or comes from anywhere.
     """
     count, steps = len(paths), paths.shape[1]
     found = np.zeros((count, packed.SIZE))
@@ -148,7 +148,10 @@ def random_places(
 
 
 def out_of_legs(scene: Scene, states: np.ndarray, morphology: np.ndarray | None = None) -> np.ndarray:
-    """The states (N, L, 13), but what is inside a leg, no initial state, waits out of reach instead."""
+    """Return the states (N, L, 13), the struck link moved out of reach in those where links overlap.
+
+    A link inside a leg would be no valid initial state. morphology: (N, L, 3); the scene's by default.
+    """
     pair = scene.between.pairs[0]
     states, struck = states.copy(), scene.index(pair.second, pair.second_links[0])
     inside = overlaps(scene.between, states, morphology)
@@ -158,7 +161,7 @@ def out_of_legs(scene: Scene, states: np.ndarray, morphology: np.ndarray | None 
 
 
 def overlaps(scene: Scene, states: np.ndarray, morphology: np.ndarray | None = None) -> np.ndarray:
-    """(N,) which of the states (N, L, 13) have a link inside another that it can touch.
+    """Return which of the states (N, L, 13) have a link inside another that it can touch, as a mask (N,).
 
     morphology: (N, L, 3); the scene's by default.
     """
@@ -177,10 +180,10 @@ def _overlaps(scene: Scene, states: Array, sizes: Array) -> Array:
 def random_episodes(
     scene: Scene, reference: Reference, count: int, seed: int, steps: int = STEPS, varied: bool = False
 ) -> tuple[Episodes, int]:
-    """Episodes from `random_starts` under the reference's targets plus smooth noise; some with pushes from outside.
+    """Record episodes from `random_starts` under the reference's targets plus smooth noise, some with `pushes`.
 
-    varied: every human is another one. Returns them, and how many were dropped because they began with one leg in the
-    other, or diverged.
+    varied: every human has another body. Returns the episodes, and how many were dropped because they began with one
+    leg in the other, or diverged.
     """
     random = np.random.default_rng(seed)
     sizes = random_people(np.random.default_rng((seed, 1)), scene, count) if varied else None
@@ -201,7 +204,7 @@ def random_episodes(
 
 
 def pushes(random: np.random.Generator, scene: Scene, count: int, steps: int) -> np.ndarray:
-    """Torques (count, steps, L, 3) [N m] on the human's links in the first steps of every tenth episode or so."""
+    """Return torques (count, steps, L, 3) [N m] on the human in the first 10 steps of about every tenth episode."""
     torques = np.zeros((count, steps, len(scene.links), 3))
     pushed = np.flatnonzero(random.random(count) < 0.1)
     human = scene.rows("human")
@@ -211,13 +214,13 @@ def pushes(random: np.random.Generator, scene: Scene, count: int, steps: int) ->
 
 
 def random_roll(random: np.random.Generator, fastest: float) -> np.ndarray:
-    """A velocity (2,) [m/s], up to `fastest`, of a ball that comes from ahead or from the kicking side."""
+    """Return a velocity (2,) [m/s], up to `fastest`, of a ball that comes from ahead or from the kicking side."""
     bearing = np.radians(random.uniform(-90.0, 30.0))
     return -random.uniform(0.0, fastest) * np.array([np.cos(bearing), np.sin(bearing)])
 
 
 def random_task(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """A target (3,) [m] and a shift of the ball (2,) [m], as `tasks.benchmarks.kick` draws them."""
+    """Return a target (3,) [m] and a shift of the ball (2,) [m], as `tasks.benchmarks.kick` draws them."""
     bearing = np.radians(random.uniform(-BEARING, BEARING))
     distance, height = random.uniform(*DISTANCE), random.uniform(*HEIGHT)
     return (

@@ -1,4 +1,4 @@
-"""The gap between a kick as the model predicted it and as it happened: contact, launch, landing, joints."""
+"""Differences between a kick as the model predicted it and as it happened: contact, launch, landing, joints."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FLYING, LANDED = 0.02, 0.005
 
 
 def contact_step(states: np.ndarray, untouched: np.ndarray | None = None) -> int | None:
-    """The first row of states (T, L, 13) in which the last link, the ball, has been struck; None if it never is.
+    """Return the first row of states (T, L, 13) in which the last link, the ball, has been struck; None if it never is.
 
     untouched: the velocities (T', 3) [m/s] that it would have if nothing touched it; at rest by default.
     """
@@ -36,10 +36,11 @@ def contact_step(states: np.ndarray, untouched: np.ndarray | None = None) -> int
 
 
 def events(scene: Scene, states: np.ndarray, untouched: np.ndarray | None = None) -> dict[str, Any]:
-    """What befalls the ball in states (T, L, 13); None for what does not. untouched: see `contact_step`.
+    """Return the ball's contact, launch and landing in states (T, L, 13); None for each that does not happen.
 
-    contact_s: when it has been struck, to a step. contact_link: by which link. contact_point_m: where, from the ball's
-    centre (3,). launch_m_s: its velocity (3,) `LAUNCH_STEPS` later. landing_m: where it first comes down (2,).
+    contact_s: when the ball has been struck, to a step. contact_link: by which link. contact_point_m: where, from the
+    ball's centre (3,). launch_m_s: its velocity (3,) `LAUNCH_STEPS` later. landing_m: where it first comes down (2,).
+    untouched: see `contact_step`.
     """
     none = dict.fromkeys(("contact_s", "contact_link", "contact_point_m", "launch_m_s", "landing_m"))
     contact = contact_step(states, untouched)
@@ -64,7 +65,7 @@ def events(scene: Scene, states: np.ndarray, untouched: np.ndarray | None = None
 def gap(
     scene: Scene, truth: np.ndarray, model: np.ndarray, start: int, untouched: np.ndarray | None = None
 ) -> dict[str, Any]:
-    """Both sides of every event, and how far apart they are.
+    """Return every event in the ground truth and in the model, and how far apart the two are.
 
     truth: states (T, L, 13). model: predicted states (T', L, 13), the first of them the truth's in row `start`.
     launch_error: |v - v'| / |v|; launch_angle_deg: between the two; links_m, joints_deg: mean distance of the human's
@@ -93,7 +94,7 @@ def gap(
 
 
 def told(found: dict[str, Any]) -> dict[str, str]:
-    """The gap for a person, a few words a line."""
+    """Return the gap as labelled lines of a few words, for display."""
     lines = {}
     if (contact := found["contact_s"])["truth"] is not None:
         lines["contact"] = (
@@ -112,7 +113,7 @@ def told(found: dict[str, Any]) -> dict[str, str]:
 
 
 def joint_rotations(scene: Scene, state: np.ndarray) -> Rotation:
-    """The rotation of each of the first body's links in its parent's frame, from the body's state (n, 13)."""
+    """Return the rotation of each child link of the first body in its parent's frame, from the body's state (n, 13)."""
     turned = Rotation.from_quat(state[:, packed.ORIENTATION], scalar_first=True)
     joints = scene.bodies[0].joints
     parents = [joint.parent for joint in joints]
@@ -120,7 +121,7 @@ def joint_rotations(scene: Scene, state: np.ndarray) -> Rotation:
 
 
 def _nearest(scene: Scene, state: np.ndarray) -> tuple[str, np.ndarray]:
-    """The human's link that meets the ball first from a state (L, 13) on, and the direction (3,) in which it does."""
+    """Return the human's link that touches the ball first after a state (L, 13), and the contact normal (3,)."""
     [pair] = scene.between.pairs
     gaps, normals = _approached(scene.between, jnp.asarray(state))
     nearest = int(np.argmin(gaps))

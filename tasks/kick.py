@@ -1,7 +1,7 @@
-"""Kick a ball to a target.
+"""Task of kicking a ball to a target.
 
     minimise over theta   w_t |x_b(t*) - p|                     the ball's path passes the target p
-                        + w_f min_t |x_f(t) - x_b(t)|^2         the foot finds the ball
+                        + w_f min_t |x_f(t) - x_b(t)|^2         the foot reaches the ball
                         + ...                                   and the body stays near the reference: see `task`
 
 t* is the moment at which the ball is nearest to p, between steps too.
@@ -35,12 +35,12 @@ from tasks.task import AFTER_CONTACT, HEIGHT, REACHABLE, Run, Task, checked_targ
 from viewer import LivePage, Wishes, check_film, nearest_approach, require_address, write_film
 
 Pair = np.ndarray | tuple[float, float]
-# A target (3,) [m] like others: straight ahead.
+# A typical target (3,) [m]: straight ahead.
 USUAL = np.array([4.0, 0.0, 0.5])
 
 
 class Kick(Task):
-    """Kick the ball so that it passes a target (3,) [m]."""
+    """Task of kicking the ball so that it passes a target (3,) [m]."""
 
     name = "kick"
 
@@ -60,13 +60,13 @@ class Kick(Task):
         return goal
 
     def over(self, start: np.ndarray, steps: int) -> Callable[[int, np.ndarray], bool]:
-        """See `Task`: the ball has been touched."""
+        """See `Task`; the task is over when the ball has been touched."""
         return self.touched(start, steps)
 
     def start(self, ball_offset: Pair = (0.0, 0.0), ball_velocity: Pair = (0.0, 0.0)) -> np.ndarray:
-        """The state (L, 13) before the kick, the ball moved by an offset (2,) [m] along the ground.
+        """Return the state (L, 13) before the kick, the ball moved by an offset (2,) [m] along the ground.
 
-        ball_velocity: (2,) [m/s], with which it rolls so that it passes that place when the reference strikes.
+        ball_velocity: (2,) [m/s] of a ball that rolls so that it passes that place when the reference strikes.
         """
         for name, value in (("ball_offset", ball_offset), ("ball_velocity", ball_velocity)):
             if np.shape(value) != (2,) or not np.isfinite(value).all():
@@ -82,7 +82,7 @@ class Kick(Task):
         return state
 
     def report(self, execution: Execution, goal: np.ndarray) -> dict[str, Any]:
-        """See `Task`; the README says what each entry is."""
+        """See `Task`; the README explains each entry."""
         states = np.stack(execution.states)
         free = self.untouched(states[0], len(states) - 1)[:, packed.VELOCITY]
         contact = contact_step(states, free)
@@ -122,7 +122,10 @@ class Kick(Task):
         return found
 
     def replayed(self, execution: Execution, target: np.ndarray, substeps: int = FINE_SUBSTEPS) -> float:
-        """The miss [m] of the executed controls, replayed from the start in the truth at another step."""
+        """Return the miss [m] of the executed controls, replayed from the start in the ground truth.
+
+        substeps: engine steps in a step of the replay.
+        """
         start, controls = execution.states[0], np.stack(execution.controls)
         after, _ = Truth(self.scene, 1, substeps, threads=1).rollout(start[None], controls[None])
         states = np.concatenate([start[None], after[0]])
@@ -132,12 +135,12 @@ class Kick(Task):
 
 
 def after_contact(contact: int | None, count: int) -> tuple[int, int]:
-    """Which of `count` states count for the miss: from first contact, if any, to 2 s after it."""
+    """Return the range of `count` states in which the miss is measured: from first contact, if any, to 2 s after it."""
     return (0, count) if contact is None else (max(contact - 1, 0), min(contact + AFTER_CONTACT + 1, count))
 
 
 def miss(path: np.ndarray, target: np.ndarray) -> float:
-    """Smallest distance [m] of the ball's path (T, 3) from the target (3,)."""
+    """Return the smallest distance [m] of the ball's path (T, 3) from the target (3,)."""
     return nearest_approach(path, target).distance
 
 
@@ -235,13 +238,13 @@ def main(
 
 
 def wished(task: Task, wishes: Wishes) -> np.ndarray:
-    """The state (L, 13) in which a kick begins that is wished for on the page."""
+    """Return the state (L, 13) in which a kick begins, with the ball's place and velocity set on the page."""
     assert isinstance(task, Kick)
     return task.start(np.array(wishes.spot), np.array(wishes.roll))
 
 
 def cli() -> None:
-    """The command `larp-kick`."""
+    """Run the command `larp-kick`."""
     run(main)
 
 

@@ -1,4 +1,4 @@
-"""Kick the ball to the left."""
+"""Command that kicks the ball to the left."""
 
 from functools import partial
 

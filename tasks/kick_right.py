@@ -1,4 +1,4 @@
-"""Kick the ball to the right."""
+"""Command that kicks the ball to the right."""
 
 from functools import partial
 

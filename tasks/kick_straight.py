@@ -1,4 +1,4 @@
-"""Kick the ball straight ahead."""
+"""Command that kicks the ball straight ahead."""
 
 from functools import partial
 

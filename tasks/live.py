@@ -1,6 +1,6 @@
-"""A task on its page: what is set there is planned at once, carried out when it is asked for, and kept if it is.
+"""Interactive page of a task: its settings are planned for at once; kicks are executed and saved on request.
 
-Whoever plans never waits for who looks: the page draws by itself, and is asked what is set before each plan.
+Planning never waits for the browser: the page draws by itself, and its settings are read before each plan.
 """
 
 from __future__ import annotations
@@ -37,11 +37,12 @@ from viewer import (
     write_film,
 )
 
-# What may be asked for: targets [m], the ball's spot from its usual one [m], how it rolls [m/s].
+# Ranges of the settings: targets [m], the ball's spot from its usual one [m], its velocity [m/s].
 TARGETS = ((1.5, -2.5, 0.11), (6.0, 2.5, 1.5))
 SPOTS = ((-0.06, -0.06), (0.06, 0.06))
 ROLLS = ((-2.0, -2.0), (1.0, 2.0))
-# Beyond what held-out random episodes reach, the page warns; of usual plans it is about 1. See `evaluation.novelty`.
+# The page warns beyond this novelty, which held-out random episodes do not reach; that of usual plans is about 1. See
+# `evaluation.novelty`.
 NOVEL = 4.0
 # Kicks whose errors are shown.
 REMEMBERED = 30
@@ -49,7 +50,7 @@ FILM = (960, 540)
 
 
 class Choices(NamedTuple):
-    """What people may choose from, by name, the usual one first. tasks: one for each reference, made when needed."""
+    """Options of the page, by name, the default first. tasks: one for each reference, made when needed."""
 
     tasks: Mapping[str, Callable[[], Task]]
     presets: Mapping[str, Preset]
@@ -57,19 +58,19 @@ class Choices(NamedTuple):
     weights: Mapping[str, Path | None]
 
     def offer(self, task: Task) -> Offer:
-        """What the page says of them."""
+        """Return the options that the page shows, with a task's cost terms and the ranges of the settings."""
         terms = tuple((term.name, term.weight) for term in task.terms)
         names = tuple(self.presets), self.dynamics, tuple(self.weights), tuple(self.tasks)
         return Offer(*names, terms, TARGETS, SPOTS, ROLLS)
 
 
 def weights_for(chosen: Path | None) -> dict[str, Path | None]:
-    """Return the weights that may be chosen, by name: those given, if any, and none."""
+    """Return the weights that can be chosen, by name: the given ones, if any, and none."""
     return ({} if chosen is None else {chosen.stem: chosen}) | {NO_WEIGHTS: None}
 
 
 class Pushed:
-    """The truth, in which bodies can be pushed between two steps."""
+    """Ground truth in which bodies can be pushed between two steps."""
 
     def __init__(self, scene: Scene, substeps: int) -> None:
         self._truth = Truth(scene, 1, substeps, threads=1)
@@ -80,7 +81,7 @@ class Pushed:
         self._truth.reset(states)
 
     def step(self, control: np.ndarray) -> np.ndarray:
-        """See `mpc.loop.World`: first, all waiting pushes change the velocities of their bodies."""
+        """See `mpc.loop.World`; before the step, all waiting pushes change the velocities of their bodies."""
         if self.waiting:
             states = self._truth.state()
             while self.waiting:
@@ -91,7 +92,7 @@ class Pushed:
 
 
 class Live:
-    """Serves one page until it is closed."""
+    """Server of one page until it is closed."""
 
     def __init__(
         self,
@@ -103,9 +104,10 @@ class Live:
         start: Callable[[Task, Wishes], np.ndarray] = lambda task, wishes: task.start(),
         finished: Callable[[Run], None] = lambda run: None,
     ) -> None:
-        """target: (3,) [m], at first. folder: where kicks are kept. start: the state (L, 13) that is wished for.
+        """Begin the page with the first task, and list the kicks that are saved in the folder.
 
-        finished: called with the first run.
+        target: (3,) [m], at first. folder: where kicks are saved. start: returns the state (L, 13) to begin in for the
+        page's settings. finished: called with the first run.
         """
         self.page, self.choices, self.folder, self.seed = page, choices, folder, seed
         self._start, self._finished = start, finished
@@ -123,13 +125,13 @@ class Live:
         self._find()
 
     def task(self, reference: str) -> Task:
-        """The task near a reference, by its name."""
+        """Return the task near a reference, by the reference's name; it is made once."""
         if reference not in self._tasks:
             self._tasks[reference] = self.choices.tasks[reference]()
         return self._tasks[reference]
 
     def planners(self, wishes: Wishes) -> Planners:
-        """The planners that are wished for."""
+        """Return the planners for the page's settings; they are made once."""
         key = self._key(wishes)
         if key not in self._fitted:
             task, preset = self.task(wishes.reference), self.choices.presets[wishes.preset]
@@ -140,7 +142,7 @@ class Live:
         return self._fitted[key]
 
     def models(self, wishes: Wishes) -> Models:
-        """The models that are wished for."""
+        """Return the models for the page's settings."""
         dynamics = next(each for each in self.choices.dynamics if each == wishes.dynamics)
         return self.task(wishes.reference).models(dynamics, self.choices.weights[wishes.weights])
 
@@ -149,7 +151,7 @@ class Live:
         return wishes.reference, wishes.preset, wishes.dynamics, wishes.weights, wishes.budget
 
     def serve(self, first: str | None = None) -> None:
-        """Plan and kick as asked, until the page is closed. first: what to do without being asked."""
+        """Plan and kick on request, until the page is closed. first: a request to begin with, such as `kick`."""
         seen, ask = -1, first
         try:
             while True:
@@ -166,7 +168,7 @@ class Live:
             self.page.close()
 
     def plan(self) -> None:
-        """Plan for what is set, and show what comes of it."""
+        """Plan for the page's settings, and show the plan or that there is none."""
         wishes = self.page.wishes
         if (task := self._ready(wishes)) is None:
             return
@@ -188,7 +190,7 @@ class Live:
         self.page.tell(f"**Ready.** {said}{reach}\n\n{self._familiar(wishes, state, info.states, controls)}")
 
     def carry_out(self) -> None:
-        """Plan and kick in the truth, with the target and the weights of each moment; then play it."""
+        """Plan and kick in the ground truth, then play the recording; each plan uses the current target and weights."""
         wishes = self.page.wishes
         if (task := self._ready(wishes)) is None:
             return
@@ -249,7 +251,7 @@ class Live:
             self._saved(self._finished, self.run)
 
     def file(self, kind: str, recording: Recording) -> tuple[str, bytes]:
-        """A recording as a file of some kind: its name and content."""
+        """Return a recording as a file: its name and content. kind: the file's extension, such as html or png."""
         name = f"{self.task(self.page.wishes.reference).name}.{kind}"
         if kind == "html":
             return name, page_of(recording).encode()
@@ -262,7 +264,7 @@ class Live:
             return name, path.read_bytes()
 
     def _familiar(self, wishes: Wishes, state: np.ndarray, expected: np.ndarray, controls: np.ndarray) -> str:
-        """Whether a learned model was trained on anything like the plan; nothing where the model is the truth."""
+        """Return a sentence on the plan's novelty to the learned model; empty where nothing is learned."""
         found = self.models(wishes).novelty(np.concatenate([state[None], expected[: len(controls)]]), controls)
         if found is None:
             return ""
@@ -270,7 +272,7 @@ class Live:
         return f"Novelty to the model: {found:.1f}, {known}."
 
     def _window(self, task: Task) -> Callable[[int], Window]:
-        """What is set on the page at the moment of each plan."""
+        """Return a function that gives a plan's window from the settings of the page when the plan is made."""
 
         def at(step: int) -> Window:
             wishes = self.page.wishes
@@ -279,7 +281,7 @@ class Live:
         return at
 
     def _ready(self, wishes: Wishes) -> Task | None:
-        """The task that is wished for, its planners made; None, and a word, where they cannot be had."""
+        """Return the task for the settings, its planners made; None, and a message on the page, where that fails."""
         try:
             if self._key(wishes) not in self._fitted:
                 self.page.tell("**Setting up** what is new: the first plan compiles, for some seconds.")
@@ -290,7 +292,7 @@ class Live:
             return None
 
     def _saved(self, save: Callable[[Run], object], run: Run) -> bool:
-        """Whether a run could be written; says why not."""
+        """Write a run and return whether that worked; the page shows why not."""
         try:
             save(run)
         except (OSError, InputError) as error:
@@ -299,7 +301,7 @@ class Live:
         return True
 
     def _told(self, plans: list[Replan], wishes: Wishes, dt: float) -> None:
-        """Figures of the kick that runs, and of those before."""
+        """Show figures of the running kick, and of those before, on the page."""
         if not plans:
             return
         infos, every = [plan.info for plan in plans], self.planners(wishes).every
@@ -324,7 +326,7 @@ class Live:
             self.page.panel.plot("Missed by [cm]", errors, "kick")
 
     def _replays(self, ask: str) -> None:
-        """Keep the last kick; open one that was kept, or show it beside what is played."""
+        """Save the last kick, open a saved one, or show it beside the one being played; `alone` hides it again."""
         page = self.page
         if ask == "keep" and self.run is not None:
             place = self.folder / time.strftime("%Y-%m-%d_%H-%M-%S")
@@ -343,23 +345,26 @@ class Live:
             page.finish(found if other is None else other, None if other is None else found)
 
     def _find(self) -> None:
-        """The kicks that are kept in the run's folder, the last one first."""
+        """List the kicks that are saved in the run's folder, the newest first, on the page."""
         found = sorted(self.folder.glob("*/summary.json"), reverse=True)
         self.kept = {path.parent.name: path.parent for path in found}
         self.page.panel.kept(list(self.kept))
 
 
 def due(last: float, step: float) -> float:
-    """When the next step is due by `time.monotonic` [s], `step` after the last: lost time is made up for by no more."""
+    """Return when the next step is due, by `time.monotonic` [s].
+
+    That is `step` after the last one; of lost time at most one `step` is made up for.
+    """
     return max(last + step, time.monotonic() - step)
 
 
 class InterruptedKickError(Exception):
-    """The kick that runs was asked to end, by this name."""
+    """Request to end the running kick; the message is the request, `reset` or `kick`."""
 
 
 def opened(task: Task, folder: Path) -> Recording:
-    """The recording of a kick that was saved. Raises InputError where it is of another scene, or damaged."""
+    """Return the recording of a saved kick. Raises InputError where it is of another scene, or damaged."""
     try:
         summary = json.loads((folder / "summary.json").read_text())
         with np.load(folder / f"{task.name}.npz", allow_pickle=False) as file:

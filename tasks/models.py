@@ -1,4 +1,4 @@
-"""The planners' models of a scene of a human and a ball: of which dynamics, and what of the scene each plan needs."""
+"""Planners' models of a scene of a human and a ball, and of the human alone, with LARP or MuJoCo as dynamics."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from mpc import Continued, Dynamics, MujocoDynamics
 
 # Steps that a plan looks beyond the reference's strike with the ball alone.
 FLIGHT = 120
-# Candidates that MuJoCo rolls out side by side: few, for a small budget's sake.
+# Candidates that MuJoCo rolls out side by side: few, to suit a small budget.
 ROWS = 8
-# What a summary says where nothing is learned.
+# Name of the weights in a summary where nothing is learned.
 NO_WEIGHTS = "none"
 
 DynamicsName = Literal["larp", "mujoco"]
 
 
 class Models(NamedTuple):
-    """The planners' models of the scene and of the human alone.
+    """Planners' models of the scene and of the human alone.
 
-    exact: whether they are the engine itself, so that there is nothing to try in it. weights: the beginning of their
+    exact: whether they are MuJoCo itself, so that there is nothing to verify in it. weights: the beginning of their
     hash, or `NO_WEIGHTS`.
     """
 
@@ -54,8 +54,8 @@ def models_of(
 ) -> Models:
     """Return the planners' models; that of the scene goes on with the ball alone once no link can reach it any more.
 
-    name: larp, with these weights or with nothing learned, or mujoco, the truth itself. substeps: engine steps in a
-    step of MuJoCo. rows: candidates that it rolls out side by side.
+    name: larp, with these weights or with nothing learned, or mujoco, the ground truth itself. substeps: engine steps
+    in a step of MuJoCo. rows: candidates that it rolls out side by side.
     """
     require_known("dynamics", name, get_args(DynamicsName))
     human, ball = scene.bodies[0].name, scene.bodies[-1].name

@@ -1,8 +1,8 @@
-"""Motion from keypoints: what a person did in a film, as a human under gravity could have done it.
+"""Reconstruction of a filmed person's motion from keypoints, as a human under gravity could have performed it.
 
-A figure is laid over the keypoints of all frames (`keypoints.lift`); from there a servo-driven human is planned so that
-its image lies on the keypoints, and the plan is executed in MuJoCo (`keypoints.physical`). What comes out is a motion
-that `tasks.kick --reference` takes.
+A figure is fitted to the keypoints of all frames (`keypoints.lift`); from that start the motion of a servo-driven human
+is planned so that its image lies on the keypoints, and the plan is executed in MuJoCo (`keypoints.physical`). The
+result is a motion that `tasks.kick --reference` takes.
 """
 
 from __future__ import annotations
@@ -40,22 +40,22 @@ from tasks.motions import angles, bvh
 from tasks.presets import PresetName
 from viewer import Overlay, write_overlay
 
-# Of states and controls [s], as every scene's by default.
+# Time step of states and controls [s], as every scene's by default.
 DT = 0.01
 # Keypoints are shown so far before the points they belong to [m], or these would hide them.
 BEFORE = 0.2
-# What is done is kept every so many seconds.
+# Progress is saved every so many seconds.
 OFTEN = 5.0
 # Heights of people [m].
 HEIGHTS = 1.3, 2.2
-# Frames that are needed, and a median error [shares of the image] beyond which the figure does not fit the person.
+# Frames that are needed, and a median error [share of the image] beyond which the figure does not fit the person.
 LEAST, ASTRAY = 10, 0.03
-# Feet of who is filmed by a camera that stands still slip less [m/s].
+# Feet slip less than this in films of a camera that stands still [m/s].
 SLIPPING = 0.12
 
 
 def shown(keypoints: Keypoints) -> tuple[int, int]:
-    """The first frame in which a person is seen, and the last; refuses what shows too little."""
+    """Return the first and the last frame in which a person is seen; raises InputError if too few show one."""
     frames = np.flatnonzero((keypoints.confidence > 0.3).sum(axis=1) >= 6)
     if len(frames) < LEAST:
         raise InputError(f"keypoints show 6 or more points in {len(frames)} frames, but need {LEAST} such frames")
@@ -63,12 +63,12 @@ def shown(keypoints: Keypoints) -> tuple[int, int]:
 
 
 def cut(keypoints: Keypoints) -> Keypoints:
-    """The frames from the first in which a person is seen to the last."""
+    """Return the keypoints from the first frame in which a person is seen to the last."""
     return keypoints.cut(*shown(keypoints))
 
 
 def angles_of(states: np.ndarray, body: Body, dt: float) -> dict[str, Any]:
-    """States (T, L, 13) as arguments of `motions.angles.motion`: those of our human of 1.75 m, as it would move."""
+    """Return states (T, L, 13) as arguments of `motions.angles.motion`, scaled to the default human of 1.75 m."""
     smaller = standing_height(human()) / standing_height(body)
     turned = [
         Rotation.from_quat(states[:, row, packed.ORIENTATION], scalar_first=True) for row in range(len(body.links))
@@ -84,11 +84,11 @@ def angles_of(states: np.ndarray, body: Body, dt: float) -> dict[str, Any]:
 
 
 class Reconstruction(NamedTuple):
-    """What a film shows, before physics and after.
+    """Reconstructed motion of a film, before physics and after.
 
     lifted: see `lift.Lifted`. body: as it was simulated. start, found: points (T, P, 3) [m] in every frame, of the
-    kinematic start and of what was executed. wanted: the start at every step. states: (N, L, 13), executed.
-    spent: what planning took.
+    kinematic start and of the executed motion. wanted: the kinematic start at every step. states: (N, L, 13), executed.
+    spent: the cost of planning.
     """
 
     lifted: lift.Lifted
@@ -101,7 +101,7 @@ class Reconstruction(NamedTuple):
 
     @property
     def fell(self) -> bool:
-        """Whether the pelvis was below half its standing height."""
+        """Return whether the pelvis was below half the standing height in any state."""
         return bool((self.states[:, 0, 2] < 0.5 * standing_height(self.body)).any())
 
 
@@ -114,10 +114,10 @@ def reconstruct(
     kept: Kept | None = None,
     at: Callable[[int, int], None] = lambda step, steps: None,
 ) -> Reconstruction:
-    """The physical motion from the kinematic start on, by a planner whose model is LARP or MuJoCo.
+    """Plan and execute the physical motion from the kinematic start, with LARP or MuJoCo as the planner's model.
 
-    preset: what a plan may cost. kept: to go on from, and to keep what is done in. at: called after every step, with
-    their number.
+    preset: the cost of a plan. kept: the saved progress to go on from, and to save progress in. at: called after every
+    step, with the number of steps done and of all.
     """
     figure = figures.figure()
     body = figure.of(lifted.proportions)
@@ -154,7 +154,7 @@ def reconstruct(
 
 
 def overlay_of(film: Keypoints, made: Reconstruction) -> Overlay:
-    """The motion under the keypoints, for a page."""
+    """Return the motion under the keypoints, for a page."""
     lens = made.lifted.camera
     position, turn = np.asarray(lens.position, float), np.asarray(lens.turn, float)
     depth = (made.found - position) @ turn[2]
@@ -292,7 +292,7 @@ def main(
 
 
 def cli() -> None:
-    """The command `larp-pose`."""
+    """Run the command `larp-pose`."""
     run(main)
 
 

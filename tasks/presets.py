@@ -1,4 +1,4 @@
-"""What a plan may cost: presets, and presets that fit into a time."""
+"""Presets of a plan's optimisers and their cost, and their scaling to a time budget."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ AGAIN = 0.2
 # Candidates of the smallest round.
 LEAST = 8
 STEPS = GaussNewton(rounds=2, directions=24)
-# A first plan that misses its target by more, in the model, has gone astray [m]; so has a replan, which has less time.
+# A first plan that misses its target by more, in the model, has failed to converge [m]; so has a replan, which has less
+# time.
 ASTRAY, LATE = (("target", 0.1),), (("target", 0.05),)
 REPLAN = GaussNewton(rounds=1), Unless(LATE, (GaussNewton(rounds=4),))
 STAND = CEM(samples=64, rounds=2, elites=12, decay=1.0)
@@ -27,11 +28,11 @@ Stage = tuple[Optimizer, ...]
 
 @dataclass(frozen=True)
 class Preset:
-    """How much a plan may cost: the optimisers of the first plan and of each replan, and steps between replans.
+    """Trade of time for accuracy: optimisers of the first plan and of each replan, and steps between replans.
 
-    verify: rounds of trials in the truth of the first plan and of each replan, at most; 0 for none. correct: what
-    searches on between two of them. candidates: tried in a round. enough: a miss, in truth, that ends them [m]. stand:
-    optimisers of the plans that keep the human up after the kick.
+    verify: rounds of trials in the ground truth of the first plan and of each replan, at most; 0 for none. correct: the
+    optimiser that searches on between two rounds. candidates: tried in a round. enough: a miss, in the ground truth,
+    that ends the trials [m]. stand: optimisers of the plans that keep the human up after the kick.
     """
 
     first: Stage
@@ -77,10 +78,11 @@ def _whole(value: object) -> bool:
 
 
 def _found(rounds: int, *around: int) -> Stage:
-    """Steps from the reference on; where they end far off, steps from the best of what is found around it.
+    """Return the stage of a first plan: Gauss-Newton steps from the reference, then searches where they end far off.
 
-    Searched in so many rounds, and where that was not enough in the next so many, with as many candidates as the
-    simulator rolls out side by side. The spread stays wide: it is for steps to converge.
+    rounds: of the steps. around: rounds of each search; the next search is run only where the one before was not
+    enough. A search samples candidates around the reference, as many as the simulator rolls out side by side, and steps
+    go on from the best of them. Its spread stays wide: convergence is left to the steps.
     """
     steps = replace(STEPS, rounds=rounds)
     searches = (CEM(32, each, 8, decay=1.0, floor=0.2) for each in around)
@@ -98,18 +100,18 @@ PRESETS: dict[str, Preset] = {
 
 
 def usable(dynamics: Dynamics, optimizers: Stage) -> Stage:
-    """Those of the optimisers that these dynamics serve."""
+    """Return the optimisers that work with these dynamics: those that need gradients only where there are some."""
     return tuple(each for each in optimizers if dynamics.differentiable or not each.differentiates)
 
 
 def preset_of(name: str) -> Preset:
-    """The preset of this name."""
+    """Return the preset of this name; raises InputError for an unknown one."""
     require_known("preset", name, PRESETS)
     return PRESETS[name]
 
 
 def changed(preset: Preset, changes: Sequence[str]) -> Preset:
-    """The preset with other fields, each given as NAME=VALUE: "every=2", "again.0.rounds=3", "verify=(4, 2)"."""
+    """Return the preset with changed fields, each as NAME=VALUE: "every=2", "again.0.rounds=3", "verify=(4, 2)"."""
     for change in changes:
         path, _, value = change.partition("=")
         try:
@@ -136,7 +138,7 @@ def _changed(part: Any, path: Sequence[str], value: Any, change: str) -> Any:
 
 
 class Seconds(NamedTuple):
-    """What plans take, compilation left out [s]: the first one, a replan, and one that keeps the human up."""
+    """Times that plans take without compilation [s]: the first one, a replan, and one that keeps the human up."""
 
     first: float
     again: float
@@ -144,10 +146,10 @@ class Seconds(NamedTuple):
 
 
 def within(preset: Preset, seconds: float, measure: Callable[[Preset], Seconds]) -> Preset:
-    """The preset with as many candidates as its first plan can try in `seconds`, and each replan in a fifth of them.
+    """Return the preset with as many candidates as its first plan can try in `seconds`, each replan in a fifth of them.
 
-    The plans that keep the human up do not take longer than replans either, and what plans would do only where they
-    went astray is left out. measure: what a preset's plans take.
+    The plans that keep the human up do not take longer than replans either, and optimisers that run only where a plan
+    failed to converge are left out. measure: returns the times that a preset's plans take.
     """
     if not (math.isfinite(seconds) and seconds > 0.0):
         raise InputError(f"budget is {seconds}, but must be a finite number of seconds > 0")
@@ -173,7 +175,7 @@ def _usual(stage: Stage) -> Stage:
 
 
 def scaled(preset: Preset, factors: Seconds) -> Preset:
-    """The preset with so many times the candidates in each of its plans; what is tried in the truth stays."""
+    """Return the preset with `factors` times the candidates in its plans; trials in the ground truth stay."""
     return replace(
         preset,
         first=tuple(fitted(each, factors.first) for each in preset.first),
@@ -183,10 +185,10 @@ def scaled(preset: Preset, factors: Seconds) -> Preset:
 
 
 def fitted(optimizer: Optimizer, factor: float) -> Optimizer:
-    """An optimiser with so many times the candidates: by its rounds, and by a round's candidates.
+    """Return the optimiser with `factor` times the candidates: by its rounds, and by a round's candidates.
 
     Sampling shares the factor evenly between both, `GaussNewton` has fewer directions only where no round is left to
-    spare. Anyone's own stays as it is.
+    spare, `Gradient` scales its steps. An optimiser of any other kind stays as it is.
     """
     match optimizer:
         case CEM() | MPPI():

@@ -1,5 +1,7 @@
-"""Refine the key poses of the embedded kick in the truth, by CMA-ES (N. Hansen and A. Ostermeier, Evolutionary
-Computation 9 (2001)) with a diagonal covariance at first (R. Ros and N. Hansen, PPSN 2008).
+"""Refinement of the key poses of the embedded kick in the ground truth, by CMA-ES.
+
+CMA-ES: N. Hansen and A. Ostermeier, Evolutionary Computation 9 (2001); with a diagonal covariance at first: R. Ros and
+N. Hansen, PPSN 2008.
 
     minimise over x   mean_k [ strike(S^k) + stand(S^k) ] + w |x - x^authored|^2
     subject to        S^k_{t+1} = truth(S^k_t, Q_t + noise^k_t),  S^k_0 and Q from the key poses x
@@ -30,7 +32,7 @@ from tasks.motions import key_poses
 from tasks.motions.key_poses import KeyPoses
 from tasks.motions.references import starts
 
-# What a kick should be: launch and toe speed [m/s], elevation of the launch [rad], earliest and latest step of the
+# Aims of a kick: launch and toe speed [m/s], elevation of the launch [rad], earliest and latest step of the
 # strike, clearance of the toes before it [m], and how long it is watched [steps].
 LAUNCH, TOE, ELEVATION, STRIKE, CLEARANCE, WATCHED = (11.0, 14.0), (9.5, 14.0), 0.2, (32, 42), 0.015, 300
 # Spreads of the search: by joint angle [rad], lean [rad], velocity [m/s], ball's place [m].
@@ -38,7 +40,7 @@ ANGLE, LEAN, VELOCITY, PLACE = 0.15, 0.03, 0.15, 0.03
 
 
 def numbers(poses: KeyPoses) -> np.ndarray:
-    """What the search varies (D,), in units of its spreads; the angles first, by joint, axis and time."""
+    """Return the search variables (D,) in units of their spreads; the angles first, by joint, axis and time."""
     angles = np.array(list(poses.angles.values())).ravel() / ANGLE
     return np.concatenate(
         [angles, np.divide(poses.lean, LEAN), np.divide(poses.velocity[:2], VELOCITY), np.divide(poses.ball, PLACE)]
@@ -46,7 +48,7 @@ def numbers(poses: KeyPoses) -> np.ndarray:
 
 
 def with_numbers(poses: KeyPoses, x: np.ndarray) -> KeyPoses:
-    """The key poses that `numbers` says x of, to the digits of their file."""
+    """Return key poses with the search variables x, see `numbers`, rounded to the digits of their file."""
     angles = np.round(ANGLE * x[:-6].reshape(len(poses.angles), len(poses.times)), 3)
     return dataclasses.replace(
         poses,
@@ -58,12 +60,12 @@ def with_numbers(poses: KeyPoses, x: np.ndarray) -> KeyPoses:
 
 
 def outside(value: np.ndarray, lower: float, upper: float) -> np.ndarray:
-    """How far values are outside an interval."""
+    """Return how far values are outside an interval; 0 inside."""
     return np.maximum(lower - value, 0.0) + np.maximum(value - upper, 0.0)
 
 
 def costs(scene: Scene, states: np.ndarray) -> dict[str, np.ndarray]:
-    """The named costs (N,) of kicks (N, T + 1, L, 13)."""
+    """Return the named costs (N,) of kicks (N, T + 1, L, 13)."""
     human, count = scene.bodies[0], np.arange(len(states))
     foot = human.links[human.link("right_foot")]
     right, left = (states[:, :, human.link(f"{side}_foot")] for side in ("right", "left"))
@@ -114,7 +116,7 @@ def costs(scene: Scene, states: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _axis(orientation: np.ndarray, axis: int) -> np.ndarray:
-    """Column `axis` (*, 3) of the rotation matrices of quaternions (*, 4)."""
+    """Return column `axis` (*, 3) of the rotation matrices of quaternions (*, 4)."""
     w, x, y, z = np.moveaxis(orientation, -1, 0)
     columns = (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
@@ -125,7 +127,10 @@ def _axis(orientation: np.ndarray, axis: int) -> np.ndarray:
 
 
 def disturbances(random: np.random.Generator, scene: Scene, kicks: int, size: float) -> tuple[np.ndarray, np.ndarray]:
-    """Shifts of the ball (kicks, 2) [m] and noise on joint targets (kicks, WATCHED, J, 3) [rad]; none on the first."""
+    """Return shifts of the ball (kicks, 2) [m] and noise on joint targets (kicks, WATCHED, J, 3) [rad].
+
+    The first kick has neither. size: factor of both.
+    """
     shift = size * random.uniform(-SHIFT, SHIFT, (kicks, 2))
     noise = np.zeros((kicks, WATCHED, len(scene.motors), 3))
     noise[:, : STRIKE[1]] = smooth_noise(random, kicks, STRIKE[1], 7, 0.5 * size * stray(scene))
@@ -136,7 +141,7 @@ def disturbances(random: np.random.Generator, scene: Scene, kicks: int, size: fl
 def perform(
     scene: Scene, truth: Truth, poses: list[KeyPoses], shift: np.ndarray, noise: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """The named costs (N, K) of N key poses, each under K disturbances."""
+    """Return the named costs (N, K) of N key poses, each executed under K disturbances."""
     kicks = len(shift)
     states = np.repeat(starts(scene, poses), kicks, axis=0)
     states[:, -1, :2] += np.tile(shift, (len(poses), 1))

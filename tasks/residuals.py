@@ -1,4 +1,4 @@
-"""Residuals that tasks share."""
+"""Residuals of cost terms that tasks share."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mpc import nearest_on_path
 
 
 def pose(states: Array, controls: Array, context: Any, human: slice = slice(None)) -> Array:
-    """(H, 3 n) how far the human's links, seen from the pelvis, are from the reference's [m].
+    """Return how far the human's links, seen from the pelvis, are from the reference's (H, 3 n) [m].
 
     context: `reference` (H, n, 3) [m], and `counted` (H,), the share to which each step counts. human: rows of its n
     links in states (H', L, 13).
@@ -23,22 +23,22 @@ def pose(states: Array, controls: Array, context: Any, human: slice = slice(None
 
 
 def effort(states: Array, controls: Array, context: Any) -> Array:
-    """(H, 3 J) how far joint targets (H, J, 3) are from the reference's, `controls` (H, J, 3) [rad] of the context."""
+    """Return how far joint targets (H, J, 3) are from the reference's, the context's `controls`, (H, 3 J) [rad]."""
     return (controls - context["controls"]).reshape(len(controls), -1)
 
 
 def apart(states: Array, controls: Array, context: Any, link: int, other: int) -> Array:
-    """(3,) how far two links, by their rows, are apart where they come nearest to each other under control [m]."""
+    """Return the vector (3,) [m] from link `other` to `link`, by rows, where they are nearest within the controls."""
     found = states[: len(controls), link, packed.POSITION] - states[: len(controls), other, packed.POSITION]
     return found[jnp.argmin(jnp.sum(found**2, axis=-1))]
 
 
 def miss(states: Array, controls: Array, context: Any, ball: int) -> Array:
-    """(3,) from `goal` (3,) [m] of the context to where the path of a ball, by its row, passes it nearest [m]."""
+    """Return the vector (3,) [m] from the context's `goal` (3,) [m] to the nearest point of the path of row `ball`."""
     nearest, _ = nearest_on_path(states[:, ball, packed.POSITION], context["goal"])
     return nearest - context["goal"]
 
 
 def upright(states: Array, controls: Array, context: Any) -> Array:
-    """(H, 1) how far the pelvis, row 0, is below `height` [m] of the context."""
+    """Return how far the pelvis, row 0, is below the context's `height` [m], (H, 1) [m]."""
     return jnp.maximum(context["height"] - states[: len(controls), 0, 2:3], 0.0)

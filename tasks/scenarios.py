@@ -1,4 +1,4 @@
-"""The scenes that the simulator is trained and judged on, by name: the kick's, and the paper's diagnostic ones."""
+"""Scenes on which the simulator is trained and evaluated, by name: the kick's, and the paper's diagnostic ones."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ CHAIN_WINDOWS = (10, 40, 80, 190)
 
 @dataclass(frozen=True)
 class Scenario:
-    """A scene, how its truth is drawn, and what the paper reaches there.
+    """Scene, how its ground-truth episodes are drawn, and the paper's errors there.
 
-    draw: episodes from (count, seed), and how many more diverged. windows: the first n steps over which errors are
-    averaged. paper: mean position error [m] over the windows, by body.
+    draw: returns episodes from (count, seed), and how many more were dropped. windows: the first n steps over which
+    errors are averaged. paper: mean position error [m] over the windows, by body.
     """
 
     name: str
@@ -39,7 +39,7 @@ class Scenario:
 
 
 def _kicking(scene: Scene) -> Scene:
-    """The scene of the human with a ball."""
+    """Return a scene of a ball and a human, of the same detail as the scene's."""
     return human_and_ball(detail=detail_of(scene.body("human")))
 
 
@@ -89,7 +89,7 @@ SCENARIOS = {
 
 
 def around(chosen: Scenario, reference: Path | None, varied: bool) -> Scenario:
-    """The scenario around another kick, a captured one (see `references.captured`), or with other bodies, or both."""
+    """Return the scenario around a captured kick (see `references.captured`), or with varied bodies, or both."""
     if reference is None and not varied:
         return chosen
     if not any(body.kind in KINDS.values() for body in chosen.scene.bodies):
@@ -102,14 +102,14 @@ def around(chosen: Scenario, reference: Path | None, varied: bool) -> Scenario:
 
 
 def trained_at(name: str, design: DesignName | None = None, size: SizeName | None = None) -> Path:
-    """Where a run trains a scene's weights, of its own design and size or of others."""
+    """Return the folder in which a run trains a scene's weights; design and size are named where they are given."""
     return Path("runs/train") / "_".join([name, *(each for each in (design, size) if each)])
 
 
 def scenario(name: str) -> Scenario:
-    """The scenario of that name, or the one that a Python file defines, FILE.py:NAME.
+    """Return the scenario of this name, or the one that a Python file defines, FILE.py:NAME.
 
-    There NAME is a `Scenario`, or a `Scene` without motors, whose bodies are thrown; the file is executed.
+    In the file, which is executed, NAME is a `Scenario`, or a `Scene` without motors, whose bodies are thrown.
     """
     file, _, own = name.rpartition(":")
     if not file.endswith(".py"):

@@ -1,4 +1,4 @@
-"""Sensing noise between the truth and the planner."""
+"""Sensing noise between the ground truth and the planner."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ BALL, JOINTS, VELOCITIES = 0.005, 0.5, 0.02
 
 
 def noisy(scene: Scene, random: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
-    """What sensors tell of a true state (L, 13): its joints hold, and the first body's root is where it is."""
+    """Return a function that adds sensing noise to a true state (L, 13).
+
+    Joints stay closed, and the position and orientation of the first body's root are exact.
+    """
     truth = Truth(scene, threads=1)
     body, human = scene.bodies[0], scene.rows(scene.bodies[0].name)
 

@@ -1,4 +1,4 @@
-"""Come to a stand from where the kick ends: only the human is modelled, for no ball is in reach any more.
+"""Task of coming to a stand after the kick; only the human is modelled, as no ball is in reach any more.
 
     minimise over theta   w_b mean_t s(t) |c(t) - m(t)|^2           the capture point comes to be between the feet
                         + w_f mean_t s(t) sum_i max(0, h_i(t))^2    both feet come down
@@ -8,9 +8,9 @@
 
 c = x + v sqrt(z / g) of the centre of mass is the instantaneous capture point (J. Pratt et al., "Capture Point: A Step
 toward Humanoid Push Recovery", 2006): where a foot would have to be to come to rest. m is the middle between the feet,
-h_i a foot's height above the ground, u_j what of a link's upward axis is horizontal. s rises from 0 to 1 while the kick
-swings out, and so do the targets, from the kick's last to the stance's. Where the human stands, and how wide, is left
-to the planner.
+h_i a foot's height above the ground, u_j the horizontal part of a link's upward axis. s rises from 0 to 1 once the kick
+has swung out; the targets change from the kick's to the stance's from the middle of the swing on. The planner chooses
+where the human stands, and how wide.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ KNEES, ELBOWS = 0.5, 0.25
 
 
 class Standing:
-    """The standing task of a scene's human (its first body) after a reference's strike: terms, windows and planner."""
+    """Standing task of a scene's human (its first body) after a reference's strike: terms, windows and planner."""
 
     def __init__(self, scene: Scene, reference: Reference) -> None:
         self.scene, self.reference = scene, reference
@@ -58,29 +58,29 @@ class Standing:
         self.stance = stance(scene)
 
     def capture_point(self, states: Array) -> Array:
-        """The capture point (*, 2) [m] of the human's states (*, n, 13), from the middle between its feet."""
+        """Return the capture point (*, 2) [m] of the human's states (*, n, 13), from the middle between its feet."""
         place = jnp.einsum("...lx,l->...x", packed.position(states), self.share)
         velocity = jnp.einsum("...lx,l->...x", packed.velocity(states), self.share)
         pace = jnp.sqrt(jnp.maximum(place[..., 2:], 0.1) / self.scene.gravity)
         return (place + pace * velocity)[..., :2] - jnp.mean(packed.position(states)[..., self.feet, :2], axis=-2)
 
     def balance(self, states: Array, controls: Array, context: Any) -> Array:
-        """(H, 2) the capture point from the middle between the feet [m], as far as it counts, `settled` (H,)."""
+        """Return `capture_point` (H, 2) [m], weighted by the context's `settled` (H,)."""
         return context["settled"][:, None] * self.capture_point(states)
 
     def feet_above(self, states: Array, controls: Array, context: Any) -> Array:
-        """(H, 2) how high both feet are above the ground [m], as far as it counts, `settled` (H,)."""
+        """Return the heights of both feet above the ground (H, 2) [m], weighted by the context's `settled` (H,)."""
         above = packed.position(states)[:, self.feet, 2] - self.lying
         return context["settled"][:, None] * jnp.maximum(above, 0.0)
 
     def lean(self, states: Array, controls: Array, context: Any) -> Array:
-        """(H, 4) what of the upward axes of pelvis and torso is horizontal."""
+        """Return the horizontal parts of the upward axes of pelvis and torso (H, 4)."""
         up = rotation.matrix(packed.orientation(states[:, self.trunk]))[..., :2, 2]
         return up.reshape(len(states), -1)
 
     @property
     def terms(self) -> tuple[CostTerm, ...]:
-        """The named costs of a candidate."""
+        """Return the named cost terms of a candidate."""
         return (
             CostTerm("balance", self.balance, quadratic, 100.0),
             CostTerm("feet", self.feet_above, quadratic, 50.0),
@@ -90,7 +90,7 @@ class Standing:
         )
 
     def window(self, step: int) -> Window:
-        """The targets from a step on, and how much standing counts, as the residuals' context."""
+        """Return the joint targets from a step on and, as the residuals' context, how much standing counts."""
         ahead = step - self.reference.strike + np.arange(HORIZON)
         share = smooth((ahead - 0.5 * SWUNG) / (STANCE - 0.5 * SWUNG))[:, None, None]
         last = self.reference.window(self.reference.strike + SWUNG // 2, 1)[1]
@@ -103,7 +103,7 @@ class Standing:
         return Window(controls, context)
 
     def planner(self, dynamics: Dynamics, optimizers: tuple[Optimizer, ...]) -> Planner:
-        """A planner of this task on dynamics of the human alone."""
+        """Return a planner of this task on dynamics of the human alone."""
         bounds = np.array([(motor.lower, motor.upper) for motor in self.scene.motors])
         return Planner(
             dynamics,
@@ -119,13 +119,13 @@ class Standing:
 
 
 def smooth(share: np.ndarray) -> np.ndarray:
-    """From 0 to 1 without a corner, and held beyond."""
+    """Return a smooth step of `share`: from 0 to 1 without a corner, constant outside."""
     share = np.clip(share, 0.0, 1.0)
     return share**2 * (3.0 - 2.0 * share)
 
 
 def stance(scene: Scene) -> np.ndarray:
-    """Joint targets (J, 3) [rad] of a human who stands with knees a little bent, feet flat below the hips."""
+    """Return joint targets (J, 3) [rad] of a human who stands with slightly bent knees, feet flat below the hips."""
     human = scene.bodies[0]
     targets = np.zeros((len(human.motors), 3))
     for row, (child, _, _) in enumerate(human.motors):

@@ -1,13 +1,13 @@
-"""A task: what a human does to a ball near a reference motion; and what a run of it leaves.
+"""Tasks of a human and a ball near a reference motion, and the results of their runs.
 
-    minimise over theta   sum_g w_g n_g(r_g(S, Q, goal))          what the task wants of the ball: its own terms
+    minimise over theta   sum_g w_g n_g(r_g(S, Q, goal))          the task's own goals for the ball
                         + w_r mean_t |x_i(t) - x_i^ref(t)|^2      links stay near the reference, root-aligned
                         + w_e mean_t |Q(t) - Q^ref(t)|^2          joint targets stay near the reference's
                         + w_u mean_t max(0, h - z_pelvis(t))^2    the pelvis stays up
     subject to            S_{t+1} = dynamics(S_t, Q_t),  Q = Q^ref + spline(theta)
 
-The dynamics are LARP or MuJoCo; the plan is executed in MuJoCo. A task of your own says its goals, when it is over, and
-what it reports: see `kick.py`, and `examples/`.
+The dynamics are LARP or MuJoCo; the plan is executed in MuJoCo. A task of your own defines its goals, when it is over,
+and its report: see `kick.py`, and `examples/`.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ BEYOND = 15
 LINGER = 6
 # A plan looks at least so many steps ahead, even when the strike is overdue.
 SHORTEST = 15
-# Spread of a first plan, as a share of how far the training data strays from the reference.
+# Spread of a first plan, as a share of the training data's deviation from the reference.
 SEARCH = 0.5
 KNOTS = 9
 # Steps for which an execution goes on after the strike.
@@ -74,12 +74,15 @@ class Planners(NamedTuple):
 
 
 class Task(ABC):
-    """A scene, a reference and goals; plans, executes and reports. Subclasses say what is abstract here, no more."""
+    """Scene, reference and goals, with planning, execution and report; subclasses define only what is abstract here."""
 
     name: str
 
     def __init__(self, scene: Scene, reference: Reference, substeps: int = FINE_SUBSTEPS) -> None:
-        """scene: its first body is the human, its last the ball. substeps: engine steps of the truth in a step."""
+        """Set up the task of a scene near a reference.
+
+        scene: its first body is the human, its last the ball. substeps: engine steps of the ground truth in a step.
+        """
         self.scene, self.reference, self.substeps = scene, reference, substeps
         self.human = scene.rows(scene.bodies[0].name)
         self.ball = len(scene.links) - 1
@@ -93,7 +96,7 @@ class Task(ABC):
         self._bases: dict[int, tuple[Models, Planner, Planner]] = {}  # by the model, with which they are kept
 
     def __getstate__(self) -> dict[str, Any]:
-        """Copies, and other processes, make their own models and planners."""
+        """Return the state to copy or pickle; copies, and other processes, make their own models and planners."""
         return self.__dict__ | {"_planners": {}, "_models": {}, "_bases": {}}
 
     @classmethod
@@ -107,12 +110,12 @@ class Task(ABC):
         names: str | Path | None = None,
         substeps: int = FINE_SUBSTEPS,
     ) -> Self:
-        """The task of a human and a football near the embedded reference, or near one of your own.
+        """Return the task of a human and a football near the embedded reference, or near one of your own.
 
-        reference: a captured kick (BVH, or npz), a motion in memory (`angles.motion`), or what performs it already.
+        reference: a captured kick (BVH, or npz), a motion in memory (`angles.motion`), or a finished `Reference`.
         height [m] and mass [kg] of the human; as heavy as its height squared by default. body, self_contact: see
-        `bodies.human_and_ball`. names: JSON file of what a BVH file calls our joints; see `bvh.load`. substeps: engine
-        steps of the truth in a step.
+        `bodies.human_and_ball`. names: JSON file of a BVH file's names of our joints; see `bvh.load`. substeps: engine
+        steps of the ground truth in a step.
         """
         heavy = MASS * (height / HEIGHT) ** 2 if mass is None else mass
         scene = human_and_ball(height=height, mass=heavy, detail=body, self_contact=self_contact)
@@ -126,7 +129,7 @@ class Task(ABC):
         names: str | Path | None = None,
         substeps: int = FINE_SUBSTEPS,
     ) -> Self:
-        """The task of a scene's human; see `standard`."""
+        """Return the task of a scene's human; see `standard`."""
         if names is not None and not isinstance(reference, str | Path):
             raise InputError(f"names is {str(names)!r}, but there is no file whose joints they could be")
         if reference is None:
@@ -139,43 +142,43 @@ class Task(ABC):
     @property
     @abstractmethod
     def goals(self) -> tuple[CostTerm, ...]:
-        """The terms that are this task's own.
+        """Return the cost terms that are this task's own.
 
-        Their context holds `goal`, as `asked` gives it, and `times` (H',), when the states are [s from the start]. One
+        Their context holds `goal`, as `asked` gives it, and `times` (H',), those of the states [s from the start]. One
         of them is called `target`, a distance [m]: by it presets judge whether a plan is good enough.
         """
 
     @abstractmethod
     def asked(self, goal: Any) -> Any:
-        """A goal as a pytree of arrays; refuses what makes no sense."""
+        """Return a goal as a pytree of arrays; raises InputError for one that makes no sense."""
 
     @abstractmethod
     def place(self, goal: Any) -> np.ndarray:
-        """Where a goal is drawn (3,) [m]."""
+        """Return the place at which a goal is drawn (3,) [m]."""
 
     @abstractmethod
     def over(self, start: np.ndarray, steps: int) -> Callable[[int, np.ndarray], bool]:
-        """Whether, in one of `steps` from a start (L, 13), with a state (L, 13), what is planned for has happened."""
+        """Return a predicate of step and state (L, 13), within `steps` of a start (L, 13): whether the task is over."""
 
     @abstractmethod
     def report(self, execution: Execution, goal: Any) -> dict[str, Any]:
-        """What `summary.json` says of a run: `figures`, and at least `truth_error_m` and `model_error_m`."""
+        """Return a run's entries of `summary.json`: `figures`, and at least `truth_error_m` and `model_error_m`."""
 
     @abstractmethod
     def title(self, goal: Any) -> str:
-        """Of a run, in a few words."""
+        """Return the title of a run in a few words."""
 
     @abstractmethod
     def facts(self, summary: dict[str, Any]) -> dict[str, str]:
-        """The summary for a person: what is told, and its value with its unit."""
+        """Return the summary for display: labels, and values with their units."""
 
     def start(self) -> np.ndarray:
-        """The state (L, 13) in which the reference begins."""
+        """Return the state (L, 13) in which the reference begins."""
         return self.reference.states[0].copy()
 
     @property
     def terms(self) -> tuple[CostTerm, ...]:
-        """The named costs of a candidate."""
+        """Return the named cost terms of a candidate."""
         return (
             *self.goals,
             CostTerm("reference", partial(residuals.pose, human=self.human), quadratic, 20.0),
@@ -184,7 +187,7 @@ class Task(ABC):
         )
 
     def window(self, goal: Any) -> Callable[[int], Window]:
-        """The reference's window from any step on, with the goal, as the residuals' context."""
+        """Return a function that gives a step's window of the reference, with the goal in the residuals' context."""
 
         def at(step: int) -> Window:
             states, controls = self.reference.window(step, self.horizon)
@@ -207,7 +210,7 @@ class Task(ABC):
         return at
 
     def planner(self, dynamics: Dynamics, optimizers: tuple[Optimizer, ...]) -> Planner:
-        """A planner of this task; what cannot do without gradients is left out where the dynamics have none."""
+        """Return a planner of this task; optimisers that need gradients are left out where the dynamics have none."""
         return Planner(
             dynamics,
             self.terms,
@@ -221,9 +224,9 @@ class Task(ABC):
         )
 
     def planners_of(self, preset: Preset, models: Models) -> Planners:
-        """A preset's planners; where MuJoCo is the model there is nothing to try in the truth.
+        """Return a preset's planners; where MuJoCo is the model, plans are not verified in the ground truth.
 
-        All presets of the same models share what is compiled.
+        All presets of the same models share compiled functions.
         """
         first: tuple[Optimizer, ...] = preset.first
         again: tuple[Optimizer, ...] = preset.again
@@ -254,7 +257,7 @@ class Task(ABC):
         dynamics: DynamicsName | Dynamics = "larp",
         weights: str | Path | None = None,
     ) -> tuple[Planners, str]:
-        """A preset's planners, made once, and the name of their weights; see `to`."""
+        """Return a preset's planners, made once, and the name of their weights; see `to`."""
         manifest = None if weights is None else Path(weights)
         key = (preset, dynamics if isinstance(dynamics, str) else id(dynamics), manifest)
         if key not in self._planners:
@@ -264,7 +267,7 @@ class Task(ABC):
         return self._planners[key]
 
     def models(self, dynamics: DynamicsName | Dynamics = "larp", weights: str | Path | None = None) -> Models:
-        """The models to plan with, made once; see `to`."""
+        """Return the models to plan with, made once; see `to`."""
         manifest = None if weights is None else Path(weights)
         key = (dynamics if isinstance(dynamics, str) else id(dynamics), manifest)
         if key not in self._models:
@@ -276,11 +279,11 @@ class Task(ABC):
         return self._models[key]
 
     def within(self, preset: Preset, budget: float, models: Models, goal: Any) -> Preset:
-        """The preset, scaled to so many seconds a plan; see `presets.within`. goal: any usual one."""
+        """Return the preset scaled to a budget of a plan [s]; see `presets.within`. goal: any typical one."""
         return within(preset, budget, partial(self.seconds, models, goal))
 
     def seconds(self, models: Models, goal: Any, preset: Preset) -> Seconds:
-        """What the preset's plans take for a goal, whole windows of them."""
+        """Return the times that the preset's plans take for a goal, with full horizons."""
         planners, usual = self.planners_of(preset, models), self.window(goal)
         took = []
         for planner, window, links in (
@@ -307,10 +310,9 @@ class Task(ABC):
         """Plan for a goal and execute in MuJoCo, or in a world of your own.
 
         goal: of a kick, the target (3,) [m]. preset: its name, or one of your own. dynamics: the planner's model, by
-        name or your own of the whole scene; what keeps the human up afterwards has ours. weights: manifest of the
-        model's; none by default. seed: of the planner's random numbers. state: (L, 13) to
-        begin in; see `start`. observe: called after every step. Of later runs with the same preset, dynamics and
-        weights nothing is compiled again.
+        name or your own of the whole scene; the plans that keep the human up afterwards use ours. weights: manifest of
+        the model's; none by default. seed: of the planner's random numbers. state: (L, 13) to begin in; see `start`.
+        observe: called after every step. Later runs with the same preset, dynamics and weights compile nothing again.
         """
         goal = self.asked(goal)
         planners, known_by = self.planners(preset, dynamics, weights)
@@ -332,10 +334,11 @@ class Task(ABC):
         world: World | None = None,
         window: Callable[[int], Window] | None = None,
     ) -> Execution:
-        """Plan and execute in the truth, from a state of `start`, for `steps` or until 2 s after contact.
+        """Plan and execute in the ground truth, from a state (`start` by default), for `steps`.
 
-        stands: whether plans go on after the task is over, to keep the human up. world: to execute in instead. window:
-        what is wanted from a step on, if it is not always the goal.
+        steps: by default until 20 + `AFTER_CONTACT` steps after the reference's strike. stands: whether plans go on
+        after the task is over, to keep the human up. world: to execute in instead. window: gives the targets and
+        context from a step on, if they are not always the goal's.
         """
         state = self.start() if state is None else self.checked_state(state)
         steps = self.reference.strike + 20 + AFTER_CONTACT if steps is None else steps
@@ -360,7 +363,7 @@ class Task(ABC):
         )
 
     def checked_state(self, state: ArrayLike) -> np.ndarray:
-        """A state (L, 13) of this task's scene; refuses, by name, all else."""
+        """Return a state (L, 13) of this task's scene as an array; raises InputError for anything else."""
         needed = (len(self.scene.links), packed.SIZE)
         try:
             array = np.asarray(state, float)
@@ -373,7 +376,7 @@ class Task(ABC):
         return array
 
     def touched(self, start: np.ndarray, steps: int) -> Callable[[int, np.ndarray], bool]:
-        """Whether, in a step with a state (L, 13), the ball is no longer as from the start (L, 13) if untouched."""
+        """Return a predicate of step and state (L, 13): whether the ball has left its untouched path from `start`."""
         free = self.untouched(start, steps)
 
         def at(step: int, current: np.ndarray) -> bool:
@@ -383,7 +386,7 @@ class Task(ABC):
         return at
 
     def untouched(self, state: np.ndarray, steps: int) -> np.ndarray:
-        """The ball's states (steps + 1, 13) from a state (L, 13) on, if nothing but the ground touched it."""
+        """Return the ball's states (steps + 1, 13) from a state (L, 13) on, if nothing but the ground touched it."""
         truth = Truth(self.scene.only(self.scene.bodies[-1].name), 1, self.substeps, threads=1)
         alone = state[None, self.ball :]
         after, _ = truth.rollout(alone, np.zeros((1, steps, 0, 3)))
@@ -391,11 +394,14 @@ class Task(ABC):
 
     @staticmethod
     def plans(execution: Execution) -> list[Replan]:
-        """The plans of the task itself, without the standing."""
+        """Return the plans of the task itself, without those of standing."""
         return [replan for replan in execution.replans if replan.phase == 0]
 
     def figures(self, execution: Execution, until: int, end: int) -> dict[str, Any]:
-        """What every report says: how far the body is from the reference until a row, falls until another, times."""
+        """Return the figures of every report: deviation from the reference, fall, times, and counts of rollouts.
+
+        until: the last row that counts for the deviation. end: the row before which a fall counts.
+        """
         states, plans = np.stack(execution.states), self.plans(execution)
         links = states[: until + 1, self.human, packed.POSITION]
         wanted = self.reference.states[: until + 1, self.human, packed.POSITION]
@@ -415,9 +421,9 @@ class Task(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A task that was planned and executed in the truth.
+    """Result of a task that was planned and executed in the ground truth.
 
-    summary: as `summary.json` has it; see the README for each entry.
+    summary: the content of `summary.json`; see the README for each entry.
     """
 
     task: Task
@@ -427,39 +433,39 @@ class Run:
 
     @property
     def states(self) -> np.ndarray:
-        """What happened: states (T + 1, L, 13)."""
+        """Return the executed states (T + 1, L, 13)."""
         return np.stack(self.execution.states)
 
     @property
     def joint_targets(self) -> np.ndarray:
-        """What the motors were told (T, J, 3) [rad]."""
+        """Return the executed joint targets of the motors (T, J, 3) [rad]."""
         return np.stack(self.execution.controls)
 
     @property
     def predicted(self) -> np.ndarray:
-        """What the last plan expected (T', L, 13), from the state that it saw on."""
+        """Return the states (T', L, 13) that the last plan predicted, from the state that it saw on."""
         last = self.task.plans(self.execution)[-1]
         return np.concatenate([last.state[None], last.info.states])
 
     @property
     def truth_error_m(self) -> float:
-        """By how much the target was missed, in the truth [m]."""
+        """Return by how much the target was missed, in the ground truth [m]."""
         return float(self.summary["truth_error_m"])
 
     @property
     def model_error_m(self) -> float:
-        """By how much the last plan expected to miss it [m]."""
+        """Return by how much the last plan expected to miss the target [m]."""
         return float(self.summary["model_error_m"])
 
     @property
     def costs(self) -> dict[str, list[float]]:
-        """Each term's share of the cost, plan by plan."""
+        """Return each term's share of the cost, plan by plan."""
         plans = self.task.plans(self.execution)
         return {term: [replan.info.terms[term] for replan in plans] for term in plans[-1].info.terms}
 
     @property
     def recording(self) -> Recording:
-        """For the viewer: the truth, the last plan's prediction, the reference."""
+        """Return the recording for the viewer: ground truth, the last plan's prediction, reference."""
         states, begun = self.states, self.task.plans(self.execution)[-1].step
         reference = self.task.reference.states[: len(states)]
         task, goal = self.task, self.goal
@@ -468,7 +474,7 @@ class Run:
 
     @property
     def table(self) -> Table:
-        """The result for a person."""
+        """Return the result as a table for display."""
         said, again = self.summary, self.summary["replan_ms"]["p50"]
         facts = {
             "missed by, in MuJoCo": f"{100 * self.truth_error_m:.1f} cm",
@@ -504,7 +510,7 @@ class Run:
         return folder
 
     def _repr_html_(self) -> str:
-        """The replay, where a notebook shows the run."""
+        """Return the replay as HTML, which a notebook shows for the run."""
         return framed(self.recording)
 
     def show(self, host: str = "127.0.0.1", port: int = 0) -> LivePage:
@@ -515,7 +521,7 @@ class Run:
 
 
 def checked_target(target: np.ndarray | tuple[float, ...]) -> np.ndarray:
-    """The target (3,) [m]; refuses what is not three finite numbers."""
+    """Return the target (3,) [m] as an array; raises InputError for anything but three finite numbers."""
     if np.shape(target) != (3,) or not np.isfinite(target).all():
         raise InputError(f"target is {target}, but must be three finite numbers, in metres")
     return np.asarray(target, float)

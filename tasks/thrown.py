@@ -1,4 +1,4 @@
-"""Truth episodes of bodies without motors that are thrown: they tumble, fall, and meet if there are several."""
+"""Ground-truth episodes of thrown bodies without motors, which tumble, fall, and collide if there are several."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tasks.data import overlaps
 from tasks.motions.references import clearance
 
 STEPS = 200
-# Bodies meet so long after the start [s], so high above the ground [m], so far off each other's middle [m].
+# Ranges of time [s] and height above the ground [m] at which bodies collide; deviation of their places then [m].
 MEETING, HEIGHT, ASIDE = (0.1, 0.6), (0.3, 1.2), 0.1
 # Standard deviations: velocities along the ground and upwards [m/s], spin [rad/s], bend of a joint [rad].
 SPEED, RISING, SPIN, BEND = 1.5, 0.5, 2.0, 0.4
@@ -24,7 +24,7 @@ VARIED = 0.3
 
 
 def random_sizes(random: np.random.Generator, scene: Scene, count: int) -> np.ndarray:
-    """Morphologies (count, L, 3): links longer or shorter, thicker or thinner by up to `VARIED`, no denser."""
+    """Return morphologies (count, L, 3) with lengths and radii varied by up to `VARIED`, densities unchanged."""
     sizes = np.broadcast_to(scene.morphology, (count, len(scene.links), 3)).astype(float)
     factors = random.uniform(1.0 - VARIED, 1.0 + VARIED, (*sizes.shape[:2], 2))
     length, radius = np.moveaxis(sizes[..., :2] * factors, -1, 0)
@@ -34,7 +34,7 @@ def random_sizes(random: np.random.Generator, scene: Scene, count: int) -> np.nd
 
 
 def thrown_starts(random: np.random.Generator, scene: Scene, morphology: np.ndarray) -> np.ndarray:
-    """States (N, L, 13) of bodies of sizes (N, L, 3) on their ways to one place, above the ground, joints closed."""
+    """Return states (N, L, 13) of bodies of sizes (N, L, 3) on their ways to one place, above ground, joints closed."""
     count = len(morphology)
     states = np.zeros((count, len(scene.links), packed.SIZE))
     time, height = random.uniform(*MEETING, (count, 1)), random.uniform(*HEIGHT, count)
@@ -66,9 +66,9 @@ def thrown_starts(random: np.random.Generator, scene: Scene, morphology: np.ndar
 def thrown_episodes(
     scene: Scene, count: int, seed: int, steps: int = STEPS, varied: bool = False
 ) -> tuple[Episodes, int]:
-    """Episodes from `thrown_starts`, the first link of every chain turned by a torque at first.
+    """Record episodes from `thrown_starts`, with a torque on the first link of every chain in the first `TURNED` steps.
 
-    varied: bodies of `random_sizes`. Returns them and how many diverged and were dropped.
+    varied: bodies have `random_sizes`. Returns the episodes and how many diverged and were dropped.
     """
     random = np.random.default_rng(seed)
     if varied:

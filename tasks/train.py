@@ -1,7 +1,7 @@
-"""From nothing to the weights of a scene: truth episodes, training, evaluation.
+"""Training of the weights of a scene: ground-truth episodes, training, evaluation.
 
-Every stage leaves a file in the run's folder and is skipped where that file is there; training itself goes on from
-its last checkpoint. So the same command takes up a run that was cut off.
+Every stage leaves a file in the run's folder and is skipped where that file exists; training itself goes on from its
+last checkpoint. So the same command resumes a run that was interrupted.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ EVALUATION_SEED = 1
 
 
 class TrainingStage(NamedTuple):
-    """A part of the training: what it is called, and how it trains."""
+    """Stage of the training: its name and recipe."""
 
     name: str
     recipe: training.Recipe
 
 
-# What physics lacks is learned from single steps.
+# Corrections of physics are learned from single steps.
 OVER_PHYSICS = training.Recipe(20000, 1024, ((1, 1.0),), learning_rate=1e-3, contact_share=0.0)
-# Algorithm 1 of the paper, with its losses; in small batches, which are the most updates that two cores give. Where the
-# unroll grows by more at once, what worked for a few steps runs away within more.
+# Algorithm 1 of the paper, with its losses; in small batches, which give the most updates on two cores. Where the
+# unroll grows by more at once, networks that work for a few steps diverge within more.
 GROWING = ((2, 0.1), (3, 0.05), (4, 0.05), (6, 0.1), (8, 0.1), (11, 0.1), (14, 0.1), (17, 0.1), (20, 0.3))
 ALGORITHM_1 = training.Recipe(batch=64, curriculum=GROWING, learning_rate=3e-4, emphasis=())
 STAGES: dict[DesignName, tuple[TrainingStage, ...]] = {
@@ -60,7 +60,7 @@ STAGES: dict[DesignName, tuple[TrainingStage, ...]] = {
 
 
 def stored_episodes(path: Path, scene: Scene, make: Callable[[], tuple[Episodes, int]], console: Console) -> Episodes:
-    """The episodes of a file, made and stored first where it is not there."""
+    """Return the episodes of a file; where the file does not exist, they are made and stored first."""
     if not path.exists():
         begin = time.perf_counter()
         episodes, dropped = make()
@@ -71,9 +71,9 @@ def stored_episodes(path: Path, scene: Scene, make: Callable[[], tuple[Episodes,
 
 
 def claim(folder: Path, settings: dict[str, Any]) -> None:
-    """Mark a run's folder by its settings; refuse one that was begun with others, whose stages would be kept.
+    """Write a run's settings to its folder; raise InputError if it has a run of others, whose stages would be reused.
 
-    settings: what JSON holds, by the names of arguments.
+    settings: values that JSON can hold, by the names of arguments.
     """
     path = folder / "settings.json"
     settings = json.loads(json.dumps(settings))
@@ -192,7 +192,7 @@ def main(
 
 
 def cli() -> None:
-    """The command `larp-train`."""
+    """Run the command `larp-train`."""
     run(main)
 
 

@@ -1,4 +1,4 @@
-"""Episodes of the planner's candidates on the way to kicks, with the truth as its model."""
+"""Episodes from rollouts of a kick planner's candidates, with the ground truth as its model."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from tasks.data import random_task
 from tasks.kick import Kick
 from tasks.models import models_of
 
-# It steps as the presets do, rounds enough for most kicks to hit.
+# Optimiser that steps as the presets do, with enough rounds for most kicks to hit.
 STEPS = GaussNewton(rounds=8, directions=24)
 
 
 class Watched:
-    """A truth that keeps what it rolled out: states (N, L, 13), controls (N, H, J, 3) [rad], states after each step."""
+    """Ground truth that stores its rollouts: states (N, L, 13), controls (N, H, J, 3) [rad], states after each step."""
 
     def __init__(self, truth: BatchedTruth) -> None:
         self.truth = truth
@@ -30,20 +30,20 @@ class Watched:
 
     @property
     def batch(self) -> int:
-        """How many rows it rolls out side by side."""
+        """Return the number of rows that are rolled out side by side."""
         return self.truth.batch
 
     def rollout(self, states: np.ndarray, controls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `mpc.dynamics.BatchedTruth`."""
+        """See `mpc.dynamics.BatchedTruth`; rollouts that stay finite are stored."""
         after, finite = self.truth.rollout(states, controls)
         self.seen.append((states[finite], controls[finite], after[finite]))
         return after, finite
 
 
 def tried_episodes(kick: Kick, kicks: int, each: int, seed: int, seconds: float = math.inf) -> Episodes:
-    """Of the first plans of so many random kicks, `each` of what they tried, as long as a plan.
+    """Return episodes of the first plans of `kicks` random kicks: at most `each` rollouts of a plan, with its horizon.
 
-    seconds: after which no other kick is begun.
+    seconds: time after which no other kick is begun.
     """
     random, began = np.random.default_rng(seed), time.perf_counter()
     whole = models_of(kick.scene, "mujoco", substeps=SUBSTEPS).whole
