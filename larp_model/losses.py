@@ -47,7 +47,7 @@ def displacement(scene: Scene, predicted: Array, morphology: Array) -> Array:
 def total(
     scene: Scene, weights: LossWeights, emphasis: Array, predicted: Array, true: Array, morphology: Array
 ) -> tuple[Array, dict[str, Array]]:
-    """Return the weighted sum and its terms, means over states (B, H, L, 13); `emphasis` (L,) weighs the links.
+    """Return the weighted sum and its terms, means over states (B, H, L, 13); `emphasis` (L,) weighs positions.
 
     morphology (B or 1, L, 3).
     From where a sequence strays further than `LOST` it teaches nothing: that is left out, and "lost" is its share.
