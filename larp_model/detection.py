@@ -14,7 +14,7 @@ from jax import Array
 
 from larp_model import state as packed
 from larp_model.linalg import cross, dot
-from larp_model.physics.collision import Capsules, ClosestPoints, advanced, closest, smooth_gate, time_of_impact
+from larp_model.physics.collision import CapsuleShapes, ClosestPoints, advanced, closest, smooth_gate, time_of_impact
 from larp_model.physics.kinematics import Kinematics, kinematics
 from larp_model.scene import Body, Pair, Scene
 from larp_model.state import Trajectories
@@ -47,9 +47,9 @@ def link_pairs(pair: Pair, first: Body, second: Body) -> tuple[np.ndarray, np.nd
     return np.array(rows)[:, 0], np.array(rows)[:, 1]
 
 
-def capsules(seen: Kinematics, rows: np.ndarray) -> Capsules:
+def capsules(seen: Kinematics, rows: np.ndarray) -> CapsuleShapes:
     """Return links by their rows (P,)."""
-    return Capsules(seen.position[rows], seen.half[rows], seen.sizes[rows, 1:2])
+    return CapsuleShapes(seen.position[rows], seen.half[rows], seen.sizes[rows, 1:2])
 
 
 def detect(

@@ -30,6 +30,13 @@ def dot(first: Array, second: Array) -> Array:
     return x + y + z
 
 
+def norm(vector: Array) -> Array:
+    """Return lengths (n, 1, B) of vectors (n, 3, B), with gradient zero at zero."""
+    squared = dot(vector, vector)
+    zero = squared < 1e-20
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
+
+
 def cross(first: Array, second: Array) -> Array:
     """Return cross products (..., 3, B) of vectors."""
     return _cross(first, second, -2)

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from larp_model import state as packed
 from larp_model.detection import ContactPoints, contact_points
 from larp_model.physics import collision
-from larp_model.physics.collision import Capsules, ClosestPoints
+from larp_model.physics.collision import CapsuleShapes, ClosestPoints
 from larp_model.physics.kinematics import morphology_of
 from larp_model.scene import Scene, Vector
 
@@ -33,9 +33,9 @@ class Segment(NamedTuple):
     radius: Array
 
     @property
-    def capsules(self) -> Capsules:
+    def capsules(self) -> CapsuleShapes:
         """Return the same as one pair's, with the batch last."""
-        return Capsules(*(each.reshape(-1, size).T[None] for each, size in zip(self, (3, 3, 1), strict=True)))
+        return CapsuleShapes(*(each.reshape(-1, size).T[None] for each, size in zip(self, (3, 3, 1), strict=True)))
 
 
 def closest_points(first: Segment, second: Segment) -> ClosestPoints:

@@ -1,4 +1,4 @@
-"""What the documents say is so: the README's Python runs as it stands there, commands take what they are given."""
+"""The documents are true: the README's Python runs as it stands there, commands take what they are given."""
 
 from __future__ import annotations
 

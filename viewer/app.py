@@ -42,7 +42,7 @@ Mode = Literal["waiting", "planned", "running", "replay"]
 
 
 class PageClosedError(Exception):
-    """The page was closed, or asked to stop what runs."""
+    """Raised where the page has been closed."""
 
 
 class Moment(NamedTuple):
@@ -188,7 +188,7 @@ class LivePage:
         return self._changes
 
     def asked(self, seconds: float = 0.0) -> str | None:
-        """What was asked for next; None where nothing was in so many seconds. Raises `PageClosedError` once closed."""
+        """Return the next request, or None if none comes within `seconds`; raise `PageClosedError` once closed."""
         end = clock.monotonic() + seconds
         while True:
             if self._closed.is_set():

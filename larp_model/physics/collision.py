@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model.linalg import cross, dot
+from larp_model.linalg import cross, dot, norm
 from larp_model.physics.kinematics import Kinematics
 from larp_model.scene import Scene, Surface
 
 
-class Capsules(NamedTuple):
+class CapsuleShapes(NamedTuple):
     """Capsules by their axes: centre (n, 3, B) [m], half (n, 3, B) [m] from there to one end, radius (n, 1, B) [m]."""
 
     centre: Array
@@ -41,7 +41,7 @@ class ClosestPoints(NamedTuple):
     along: Array
 
 
-def closest(first: Capsules, second: Capsules) -> ClosestPoints:
+def closest(first: CapsuleShapes, second: CapsuleShapes) -> ClosestPoints:
     """Return the closest points of pairs of capsules (C. Ericson, Real-Time Collision Detection, 5.1.9).
 
     Where axes are parallel the middle of their overlap is taken; where they cross or coincide, the normal is z.
@@ -73,21 +73,14 @@ def closest(first: Capsules, second: Capsules) -> ClosestPoints:
     return ClosestPoints(normal, distance, point, jnp.concatenate([s, t], axis=1))
 
 
-def advanced(capsules: Capsules, velocity: Array, angular_velocity: Array, time: Array) -> Capsules:
+def advanced(capsules: CapsuleShapes, velocity: Array, angular_velocity: Array, time: Array) -> CapsuleShapes:
     """Return capsules after times (n, 1, B) [s] at constant velocities (n, 3, B) [m/s] and [rad/s].
 
     The axes turn to first order and keep their length.
     """
     half = capsules.half + time * cross(angular_velocity, capsules.half)
     shrink = norm(capsules.half) / jnp.maximum(norm(half), 1e-12)
-    return Capsules(capsules.centre + time * velocity, shrink * half, capsules.radius)
-
-
-def norm(vector: Array) -> Array:
-    """Return lengths (n, 1, B) of vectors (n, 3, B), with gradient zero at zero."""
-    squared = dot(vector, vector)
-    zero = squared < 1e-20
-    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
+    return CapsuleShapes(capsules.centre + time * velocity, shrink * half, capsules.radius)
 
 
 def time_of_impact(distance: Array, approach: Array, limit: Array | float) -> Array:
@@ -174,7 +167,7 @@ class Candidates:
         def at(time: Array) -> Array:
             position = seen.position + time * (seen.velocity + 0.5 * time * rates.acceleration)
             half = turned(seen.half, time * (seen.angular_velocity + 0.5 * time * rates.angular_acceleration))
-            one, two = (Capsules(position[rows], half[rows], seen.sizes[rows, 1:2]) for rows in (first, second))
+            one, two = (CapsuleShapes(position[rows], half[rows], seen.sizes[rows, 1:2]) for rows in (first, second))
             return closest(one, two).distance[:, 0]
 
         times = jnp.linspace(0.0, dt, settings.moments, dtype=seen.state.dtype)

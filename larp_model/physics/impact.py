@@ -23,7 +23,7 @@ from larp_model.physics import contact
 from larp_model.physics.articulated import Momenta
 from larp_model.physics.collision import (
     Candidates,
-    Capsules,
+    CapsuleShapes,
     ContactSettings,
     Rates,
     Sides,
@@ -235,7 +235,7 @@ class System:
         """Return arms (S, 3, B) [m] from sides to contact points, normals (C, 3, B), and gaps (C, 1, B) [m]."""
         pairs, radius = self.pairs, self.radius
         one, two = (
-            Capsules(moves.centre[side], moves.half[side], radius[side])
+            CapsuleShapes(moves.centre[side], moves.half[side], radius[side])
             for side in (slice(pairs), slice(pairs, 2 * pairs))
         )
         found = closest(one, two)

@@ -27,8 +27,8 @@ class Kinematics(NamedTuple):
     """Links of a scene, or of one body, in states (L, 13, B), and their joints.
 
     sizes: length [m], radius [m] and mass [kg], (L, 3, B). matrices: (L, 3, 3, B) from link to world. half: (L, 3, B)
-    [m] from the links' centres to one end of their axes. local_anchors: in the links' frames; anchors: in the world's
-    axes. displacement: (J, 3, B) [m], the joint by the child, less by the parent.
+    [m] from the links' centres to one end of their axes. local_anchors: in the links' frames. displacement: (J, 3, B)
+    [m], the joint by the child, less by the parent.
     """
 
     state: Array
@@ -36,7 +36,6 @@ class Kinematics(NamedTuple):
     matrices: Array
     half: Array
     local_anchors: Anchors
-    anchors: Anchors
     displacement: Array
 
     @property
@@ -62,13 +61,10 @@ class Kinematics(NamedTuple):
     def of(self, scene: Scene, body: str) -> Kinematics:
         """Return those of a body of the scene."""
         rows, joints = scene.rows(body), scene.joint_rows(body)
-        local, turned = (
-            Anchors(each.child[joints], each.parent[joints]) for each in (self.local_anchors, self.anchors)
-        )
+        local = Anchors(self.local_anchors.child[joints], self.local_anchors.parent[joints])
         return Kinematics(
-            self.state[rows], self.sizes[rows], self.matrices[rows], self.half[rows], local, turned,
-            self.displacement[joints],
-        )  # fmt: skip
+            self.state[rows], self.sizes[rows], self.matrices[rows], self.half[rows], local, self.displacement[joints]
+        )
 
 
 def kinematics(scene: Scene, state: Array, sizes: Array) -> Kinematics:
@@ -83,9 +79,14 @@ def kinematics(scene: Scene, state: Array, sizes: Array) -> Kinematics:
         local_anchors(scene, children, [joint.child_anchor for *_, joint in joints], sizes),
         local_anchors(scene, parents, [joint.parent_anchor for *_, joint in joints], sizes),
     )
-    turned = Anchors(mv(matrices[children], local.child), mv(matrices[parents], local.parent))
-    displacement = position[children] + turned.child - (position[parents] + turned.parent)
-    return Kinematics(state, sizes, matrices, half, local, turned, displacement)
+    anchors = turned_anchors(local, matrices, children, parents)
+    displacement = position[children] + anchors.child - (position[parents] + anchors.parent)
+    return Kinematics(state, sizes, matrices, half, local, displacement)
+
+
+def turned_anchors(local: Anchors, matrices: Array, children: np.ndarray | slice, parents: np.ndarray) -> Anchors:
+    """Return joint anchors in the world's axes, of links turned by matrices (L, 3, 3, B); rows of both ends (J,)."""
+    return Anchors(mv(matrices[children], local.child), mv(matrices[parents], local.parent))
 
 
 def local_anchors(scene: Scene, rows: np.ndarray, points: list[Vector], sizes: Array) -> Array:

@@ -20,7 +20,7 @@ from larp_model import rotation
 from larp_model.linalg import barrier, cross, dot, mm, mv, rotated, rotation_matrices
 from larp_model.physics.articulated import Inertia, Momenta, tree
 from larp_model.physics.ground import Ends, GroundProblem, motion_on_ground
-from larp_model.physics.kinematics import Anchors, Kinematics, motor_scale
+from larp_model.physics.kinematics import Anchors, Kinematics, motor_scale, turned_anchors
 from larp_model.scene import Body
 
 GAMMA = 1.0 - math.sqrt(0.5)
@@ -77,6 +77,7 @@ def articulated_motion(
     targets (j, 3, B) of its joints [rad], outside (n, 3, B) [N m] torque. The inertia is that of the first stage.
     """
     h, sizes, local = GAMMA * dt, seen.sizes, seen.local_anchors
+    parents = np.array([joint.parent for joint in body.joints], int)
     orientation, velocity, spin = seen.orientation, seen.velocity, seen.angular_velocity
     stronger = motor_scale(body, sizes)
     down = jnp.array([0.0, 0.0, -gravity], velocity.dtype)[:, None]
@@ -91,7 +92,7 @@ def articulated_motion(
         inertia = inertias(body, matrices, sizes)
         momentum, mass = mv(inertia.turning, spin), sizes[:, 2:3]
         push = Momenta(momentum + h * (outside - cross(spin, momentum)), mass * (velocity + h * down))
-        anchors = turned_anchors(body, local, matrices)
+        anchors = turned_anchors(local, matrices, slice(1, None), parents)
         before = rotation_matrices(start)
         pull, hold = servos(body, start, before, targets, spin, h, stronger)
         height = seen.position[:, 2:] + raised
@@ -184,12 +185,6 @@ def angles(parent: Array, child: Array) -> Array:
     w, v, a, u = parent[:, :1], parent[:, 1:], child[:, :1], child[:, 1:]
     relative = jnp.concatenate([w * a + dot(v, u), w * u - a * v - cross(v, u)], axis=1)
     return jnp.moveaxis(rotation.to_rotation_vector(jnp.moveaxis(relative, 1, -1)), -1, 1)
-
-
-def turned_anchors(body: Body, local: Anchors, matrices: Array) -> Anchors:
-    """Return joint anchors in the world's axes, of links turned by matrices (n, 3, 3, B)."""
-    parents = np.array([joint.parent for joint in body.joints], int)
-    return Anchors(mv(matrices[1:], local.child), mv(matrices[parents], local.parent))
 
 
 def moments(length: Array, radius: Array, mass: Array) -> tuple[Array, Array]:

@@ -48,8 +48,7 @@ def step(
 ) -> Array:  # fmt: skip
     """Return states (B, L, 13) one `scene.dt` after states (B, L, 13).
 
-    control (B, J, 3) [rad], torque (B, L, 3) [N m], morphology (B or 1, L, 3). correct: see
-    `Correction`.
+    control (B, J, 3) [rad], torque (B, L, 3) [N m], morphology (B or 1, L, 3). correct: see `Correction`.
     """
     before, targets, torques, sizes = (jnp.moveaxis(each, 0, -1) for each in (state, control, torque, morphology))
     begun = Driven(before, targets, torques, jnp.broadcast_to(sizes, (*sizes.shape[:2], state.shape[0])))
@@ -114,7 +113,7 @@ def _where(near: Array, finely: Callable[[Driven], Array], begun: Driven, otherw
 def _rates(
     scene: Scene, seen: Kinematics, motion: BodyMotion, articulations: dict[str, Articulation], dt: float
 ) -> Rates:
-    """Return how all links of a scene accelerate whose bodies move so within `dt` [s]."""
+    """Return the accelerations of all links of a scene, from the motion of its bodies within `dt` [s]."""
     rates = []
     for body in scene.bodies:
         rows = scene.rows(body.name)

@@ -22,7 +22,7 @@ from larp_model.engines.mujoco import Truth
 from larp_model.engines.mujoco import finite as truth_finite
 from larp_model.errors import InputError
 from larp_model.physics import kinematics
-from larp_model.physics.collision import Capsules, closest
+from larp_model.physics.collision import CapsuleShapes, closest
 from larp_model.scene import Pair, Scene
 from larp_model.simulator import Simulator
 from mpc import CostTerm, evaluate
@@ -477,7 +477,7 @@ def geometry() -> list[Row]:
 
     def distance(numbers: jax.Array) -> jax.Array:
         one, two = (
-            Capsules(
+            CapsuleShapes(
                 numbers[n][None, :, None], numbers[n + 1][None, :, None], jnp.full((1, 1, 1), radius, numbers.dtype)
             )
             for n, radius in ((0, 0.1), (2, 0.05))
