@@ -1,4 +1,4 @@
-"""Many kicks without a page, as a data set: one npz file of targets, states and joint targets, in float32.
+"""Data set of many kicks, without a page: one npz file of targets, states and joint targets, in float32.
 
 python examples/batch.py 1000 runs/kicks.npz        # and, as a last argument, how many processes share the work
 """
@@ -19,7 +19,7 @@ Row = tuple[np.ndarray, np.ndarray, np.ndarray, float, bool]
 
 
 def kicks(kick: Kick, numbers: np.ndarray, seed: int) -> list[Row]:
-    """Kicks to random targets, the ball's spot moved a little each time; compiled once."""
+    """Return kicks to random targets, with the ball's place moved a little each time; compiled once."""
     rows = []
     for number in track(numbers.tolist(), "kicks"):
         target, offset = random_task(np.random.default_rng((seed, number)))
@@ -35,7 +35,7 @@ def main(count: int = 1000, path: str = "runs/kicks.npz", processes: int = 1, se
     with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
         made = pool.map(kicks, [Kick.standard()] * processes, shares, [seed] * processes)
         targets, states, controls, errors, fell = zip(*chain.from_iterable(made), strict=True)
-    steps = min(map(len, states))  # what lies beyond them, of kicks that took longer, is left out
+    steps = min(map(len, states))  # longer kicks are cut to this length
     arrays = {
         "targets": np.array(targets, np.float32),  # (N, 3) [m]
         "states": np.array([each[:steps] for each in states], np.float32),  # (N, T, L, 13)

@@ -1,6 +1,6 @@
-"""A cost of one's own: kick to a target, and gently. A cost is a named residual, a norm and a weight.
+"""Cost of one's own: kick to a target, and gently. A cost is a named residual, a norm and a weight.
 
-The residual sees one candidate: states (H', L, 13) of the scene, controls (H, J, 3) [rad] and the task's context; it
+The residual gets one candidate: states (H', L, 13) of the scene, controls (H, J, 3) [rad] and the task's context; it
 returns a vector, or one for each instant. All is JAX, so that the planner may differentiate it.
 """
 
@@ -17,13 +17,15 @@ TARGET = (4.0, 0.5, 0.4)
 
 
 class Gentle(Kick):
-    """A kick whose ball should leave at `speed` [m/s]."""
+    """Kick whose ball should leave at `speed` [m/s]."""
 
     name = "gentle"
     speed = 10.0
 
     @property
     def goals(self) -> tuple[CostTerm, ...]:
+        """Return the terms of a kick, and one for the ball's highest speed."""
+
         def pace(states: Array, controls: Array, context: Any) -> Array:
             speeds = jnp.linalg.norm(states[:, self.ball, packed.VELOCITY], axis=-1)
             return speeds.max(keepdims=True) - self.speed
@@ -32,7 +34,7 @@ class Gentle(Kick):
 
 
 def main() -> None:
-    """The same target with and without the cost."""
+    """Kick to the same target with and without the cost."""
     usual, gentle = (task.standard().to(TARGET, preset="fast") for task in (Kick, Gentle))
     for what, run in (("as it comes", usual), ("gently", gentle)):
         speed = run.summary["ball_speed_m_s"]

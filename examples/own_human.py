@@ -1,4 +1,4 @@
-"""A humanoid of one's own, from an MJCF file: MuJoCo's, as it comes with MuJoCo's MJX; 41 kg on legs of 0.87 m.
+"""Humanoid of one's own, from an MJCF file: MuJoCo's, as it comes with MuJoCo's MJX; 41 kg on legs of 0.87 m.
 
 Its capsules and hinges become our links and ball joints, or are refused by name: see `larp_model/mjcf.py`. It kicks at
 once, planned by our physics or by MuJoCo.
@@ -17,7 +17,7 @@ TARGET = (3.0, 0.3, 0.4)
 
 
 def main() -> None:
-    """It kicks as our human does."""
+    """Kick with this humanoid as with our human."""
     kick = Kick.of(kicking(humanoid(SOURCE), ball()))
     run = kick.to(TARGET, preset="fast")
     print(f"missed by {100 * run.truth_error_m:.1f} cm at {run.summary['ball_speed_m_s']:.1f} m/s")

@@ -1,8 +1,8 @@
-"""A model of one's own for the planner: ours, and the wind of `own_world.py`.
+"""Model of one's own for the planner: ours, with the wind of `own_world.py`.
 
 A model has `differentiable` and `rollout(states, controls, *, steps=None)`: states (N, L, 13) and controls (N, H, J, 3)
-in, states (N, H', L, 13) out, of steps 1 to H' >= H. It is pure and traced by JAX; its rows know nothing of each other;
-one that diverged is NaN. steps () says how many of the H are wanted: the rest repeat the last. See `mpc.Dynamics`.
+in, states (N, H', L, 13) out, of steps 1 to H' >= H. It is pure and traced by JAX; its rows are independent; one that
+diverged is NaN. steps () is the number of the H steps that is wanted: the rest repeat the last. See `mpc.Dynamics`.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from tasks.models import models_of
 
 @dataclass(frozen=True)
 class InWind:
-    """Another model whose ball, once it flies, drifts by half of wind times time squared."""
+    """Model like another, `still`, whose ball, once it flies, drifts by half of wind times time squared."""
 
     still: Dynamics
     ball: int
@@ -39,7 +39,7 @@ class InWind:
 
 
 def main() -> None:
-    """In the wind, plans of a model that knows it miss by less than half."""
+    """Kick in the wind with a model without it, and with one that has it and misses by less than half as much."""
     kick = Kick.standard()
     ours = models_of(kick.scene, "larp").whole
     knowing = InWind(ours, kick.ball, kick.scene.links[kick.ball].radius + 0.01, kick.scene.dt)

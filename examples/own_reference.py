@@ -1,4 +1,4 @@
-"""A reference of one's own: a BVH file, an npz file, or arrays of joint angles.
+"""Reference of one's own: a BVH file, an npz file, or arrays of joint angles.
 
     python examples/own_reference.py [kick.bvh or kick.npz]
 
@@ -18,7 +18,7 @@ TARGET = (4.0, 0.4, 0.4)
 
 
 def leaning(path: Path) -> None:
-    """Write the embedded kick, its torso bent by 0.1 rad more, as joint angles."""
+    """Write the embedded kick as joint angles, with the torso bent by 0.1 rad more."""
     kick = Kick.standard()
     human, states = kick.scene.bodies[0], kick.reference.states
     turns = [Rotation.from_quat(states[:, row, packed.ORIENTATION], scalar_first=True) for row in range(13)]

@@ -1,4 +1,4 @@
-"""Weights for a scene of your own: a club and a ball are thrown, learned, and rolled out from a start never seen.
+"""Weights for a scene of your own: a club and a ball are thrown, learned, and rolled out from unseen initial states.
 
 python examples/own_scene.py            # or: python -m tasks.train --scene examples/own_scene.py:CLUB_AND_BALL
 """
@@ -18,8 +18,8 @@ from tasks.thrown import thrown_episodes
 CLUB, BALL = capsule("club", length=0.6, radius=0.04, mass=0.8), ball()
 CONTACT = Pair("club", "ball", ("capsule",), ("ball",), Surface(4000.0, 120.0, 1.0))
 SCENE = Scene((CLUB, BALL), (CONTACT,))
-# A name, the scene, how its truth is drawn, the steps of 10 ms over which errors are averaged. Where bodies are to be
-# thrown, and judged over 1.9 s, the scene alone suffices.
+# Name, scene, function that draws its ground truth, steps of 10 ms over which errors are averaged. Where bodies are to
+# be thrown, and errors taken over 1.9 s, the scene alone suffices.
 CLUB_AND_BALL = Scenario("club_and_ball", SCENE, partial(thrown_episodes, SCENE, steps=60), windows=(10, 40))
 STEPS = 10
 

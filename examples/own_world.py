@@ -1,4 +1,4 @@
-"""A world of one's own: what the plan is executed in, here the simulator in a side wind; or a robot.
+"""World of one's own to execute plans in: here the simulator in a side wind; it could be a robot.
 
 A world has `reset(states)` and `step(control) -> states`: states (1, L, 13) of the whole scene, see `larp_model.state`;
 joint targets (1, J, 3), rotation vectors [rad]; a step lasts `scene.dt`, 10 ms. `reset` may move a robot to where it
@@ -18,16 +18,18 @@ WIND = np.array([0.0, 3.0, 0.0])
 
 
 class Windy:
-    """The human and the ball as the simulator knows them, and wind."""
+    """Simulator of the human and the ball, with wind."""
 
     def __init__(self, kick: Kick) -> None:
         self.simulator = Simulator.of_physics(kick.scene)
         self.dt, self.ball, self.radius = kick.scene.dt, kick.ball, kick.scene.links[kick.ball].radius
 
     def reset(self, states: np.ndarray) -> None:
+        """Put the world into states (1, L, 13)."""
         self.states = np.asarray(states, np.float32)
 
     def step(self, control: np.ndarray) -> np.ndarray:
+        """Return states (1, L, 13) after a step under joint targets (1, J, 3) [rad], with wind on a flying ball."""
         states, targets = jnp.asarray(self.states), jnp.asarray(control, jnp.float32)
         self.states = np.array(self.simulator.step(states, targets))
         if self.states[0, self.ball, 2] > self.radius + 0.01:
@@ -37,7 +39,7 @@ class Windy:
 
 
 def main() -> None:
-    """A planner that knows of no wind misses to the left: see `own_model.py`."""
+    """Kick with a planner that ignores the wind, and miss to the left: see `own_model.py`."""
     kick = Kick.standard()
     run = kick.to(TARGET, preset="fast", world=Windy(kick))
     aside = run.states[:, kick.ball, 1].max()

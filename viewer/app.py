@@ -1,7 +1,8 @@
-"""The page on which a kick is planned and watched, live while it runs and again afterwards.
+"""Page on which a kick is planned and watched, live while it runs and again afterwards.
 
-Planning, execution and drawing are apart: whoever plans says what is new and goes on; a thread of the page draws the
-latest of it, 25 times a second at most; what clients send is checked and kept until it is asked for.
+Planning, execution and drawing are separate: the planner passes new data to the page and continues; a thread of the
+page draws the latest data, at most 25 times a second; input of clients is validated and queued until the planner reads
+it.
 """
 
 from __future__ import annotations
@@ -32,9 +33,9 @@ from viewer.stage import LEGEND, Stage, whole
 from viewer.wishes import Offer, Push, Wishes
 
 FRAME = 1.0 / 25.0  # s
-# Pictures by which drawing may be behind what happens, where that comes in bursts.
+# Frames by which drawing may lag behind the execution, whose states arrive in bursts.
 BEHIND = 5
-# So many clients are drawn for at that pace; more share what time there is, for each takes the planner some.
+# Clients that are served at the full frame rate; with more it drops, for each of them costs the planner some time.
 AT_FULL_PACE = 5
 FOLLOWED = (-2.2, -3.2, 1.4)  # m, from the ball to a camera that follows it
 
@@ -42,11 +43,11 @@ Mode = Literal["waiting", "planned", "running", "replay"]
 
 
 class PageClosedError(Exception):
-    """Raised where the page has been closed."""
+    """Error raised by calls that wait for the page once it is closed."""
 
 
 class Moment(NamedTuple):
-    """A state (L, 13) of the truth at a time [s], what was just predicted from there on, and the reference's state."""
+    """State (L, 13) of the ground truth at a time [s], the new prediction from there, and the reference's state."""
 
     state: np.ndarray
     time: float
@@ -56,7 +57,7 @@ class Moment(NamedTuple):
 
 @dataclass
 class News:
-    """What is to be drawn next; None: as it is."""
+    """Data to be drawn next; a plan, fan or reference that is None is not drawn."""
 
     state: np.ndarray
     time: float
@@ -65,12 +66,12 @@ class News:
     plan_time: float = 0.0
     fan: tuple[np.ndarray, np.ndarray] | None = None
     reference: np.ndarray | None = None
-    fresh: bool = True  # all of it, the plan and its fan
-    planned: bool = True
+    fresh: bool = True  # not drawn yet
+    planned: bool = True  # the plan and its fan are not drawn yet
     waiting: deque[Moment] = field(default_factory=deque)
 
     def go_on(self) -> None:
-        """To the next of the moments that wait, or over some where many do: they come in bursts, between plans."""
+        """Advance to the next waiting moment, or skip some if many wait: they arrive in bursts, between plans."""
         for _ in range(-(-len(self.waiting) // BEHIND)):
             moment = self.waiting.popleft()
             if moment.predicted is not None:
@@ -80,11 +81,11 @@ class News:
 
 
 class LivePage:
-    """A page that follows a kick while it runs, and plays its recording once it is over.
+    """Page that follows a kick while it runs, and plays its recording once it is over.
 
-    `begin`, `planned`, `update` and `finish` return at once; a thread draws, one state after the other, and leaves some
-    out where they come faster than they can be drawn. With an offer, people set there what they wish: see `wishes` and
-    `asked`. Leaving the `with` block closes the page.
+    `begin`, `planned`, `update` and `finish` return at once; a thread draws one state after the other, and skips some
+    if they arrive faster than they can be drawn. With an offer, users choose the settings of the next kick on the page:
+    see `wishes` and `asked`. Leaving the `with` block closes the page.
     """
 
     def __init__(
@@ -94,12 +95,15 @@ class LivePage:
         offer: Offer | None = None,
         allowed: Sequence[str] = (),
     ) -> None:
-        """allowed: names of proxies by which the page is reached, too; see `server.open_server`."""
+        """Open the page at an address.
+
+        allowed: names of proxies through which the page is reached as well; see `server.open_server`.
+        """
         self._server = open_server(host, port, allowed)
         self.address = address_of(self._server)
         self.offer = offer
         self._lock, self._closed, self._moved = threading.RLock(), threading.Event(), threading.Event()
-        self._rests = threading.Event()  # while whoever plans waits for the time to come
+        self._rests = threading.Event()  # set while the planner waits for the clock
         self._changes = self._frames = 0
         self._asked: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._mode: Mode = "waiting"
@@ -108,9 +112,9 @@ class LivePage:
         self._news: News | None = None
         self._recording: Recording | None = None
         self._beside: Recording | None = None
-        self._drawn: tuple[int, frozenset[str]] | None = None  # row of the recording that is on the page, and ghosts
-        self._single = 0  # steps that may be taken although time stands still
-        self._views: dict[int, tuple[str, float]] = {}  # by client: how it looks, and the aspect that this was for
+        self._drawn: tuple[int, frozenset[str]] | None = None  # row of the recording that is drawn, and ghosts
+        self._single = 0  # single steps still to take while paused
+        self._views: dict[int, tuple[str, float]] = {}  # by client: its view, and the aspect this was for
         self._filing = threading.Lock()
         self.files: Callable[[str, Recording], tuple[str, bytes]] | None = None
         self._panel = Panel(self._server.gui, self._ask, self._change, offer)
@@ -119,7 +123,7 @@ class LivePage:
         self._thread = threading.Thread(target=self._draw, daemon=True)
         self._thread.start()
 
-    # What people do.
+    # Input of users.
 
     def _change(self) -> None:
         with self._lock:
@@ -129,7 +133,7 @@ class LivePage:
         self._moved.set()
 
     def _ask(self, name: str, client: viser.ClientHandle | None) -> None:
-        """Do at once what is the page's own, keep all else for whoever plans."""
+        """Handle at once requests that concern only the page, and queue all others for the planner."""
         if name == "play":
             self._panel.playing = not self._panel.playing
         elif name == "step":
@@ -155,11 +159,11 @@ class LivePage:
         self._moved.set()
 
     def ask(self, name: str) -> None:
-        """Ask for something as a client would: "kick", "reset", "push ball", ..."""
+        """Request an action by name as a client would, for instance "kick", "reset" or "push ball"."""
         self._ask(name, None)
 
     def aim(self, target: np.ndarray) -> None:
-        """Drag the target to (3,) [m]; it comes within what is offered."""
+        """Move the target to (3,) [m], clipped to the box that is offered, as if it had been dragged."""
         with self._lock:
             assert self._handles is not None
             self._handles.aim(target)
@@ -167,28 +171,28 @@ class LivePage:
 
     @property
     def frames(self) -> int:
-        """How many pictures have been drawn."""
+        """Return the number of frames drawn so far."""
         return self._frames
 
     @property
     def mode(self) -> Mode:
-        """What the page is at."""
+        """Return whether the page is waiting, shows a plan, follows a run or replays."""
         return self._mode
 
     @property
     def wishes(self) -> Wishes:
-        """What is set now; needs an offer, and `begin` before."""
+        """Return the settings now chosen on the page; requires an offer, and `begin` before."""
         with self._lock:
             assert self._handles is not None
             return Wishes(self._handles.target, self._handles.spot, self._handles.roll, **self._panel.asked_for())
 
     @property
     def changes(self) -> int:
-        """How often a setting has changed."""
+        """Return the number of times that a setting has changed."""
         return self._changes
 
     def asked(self, seconds: float = 0.0) -> str | None:
-        """Return the next request, or None if none comes within `seconds`; raise `PageClosedError` once closed."""
+        """Return the next request, or None if none arrives within `seconds`. Raises `PageClosedError` once closed."""
         end = clock.monotonic() + seconds
         while True:
             if self._closed.is_set():
@@ -204,11 +208,11 @@ class LivePage:
                     return None
 
     def push(self, name: str) -> Push:
-        """The push that is set, for a body by name."""
+        """Return the push set on the page, for the body with this name."""
         return Push(name, self._panel.push())
 
     def hold(self, until: float) -> None:
-        """Wait until the moment `until` of a monotonic clock [s], and for as long as time stands still on the page."""
+        """Wait until `until` [s] of the monotonic clock, and for as long as the page is paused."""
         self._rests.set()
         try:
             self._wait_for(until)
@@ -234,20 +238,21 @@ class LivePage:
 
     @property
     def playing(self) -> bool:
-        """Whether time goes on."""
+        """Return whether time runs on the page, that is, whether it is not paused."""
         return self._panel.playing
 
     @property
     def speed(self) -> float:
-        """Of time on the page, as a share of its own."""
+        """Return the speed of time on the page, as a fraction of real time."""
         return self._panel.speed
 
-    # What is shown.
+    # Output to the page.
 
     def begin(self, scene: Scene, target: np.ndarray, traced: int = -1, state: np.ndarray | None = None) -> None:
-        """Set the stage. target: (3,) [m]. traced: row in the state of the link whose path is drawn.
+        """Draw the scene without motion, as it is before a kick.
 
-        state: (L, 13), in which it usually begins; needed with an offer.
+        target: (3,) [m]. traced: row in the state of the link whose path is drawn. state: (L, 13), the usual initial
+        state; required with an offer.
         """
         with self._lock:
             self._stage = Stage(self._server, scene, target, traced)
@@ -270,7 +275,7 @@ class LivePage:
         fan: tuple[np.ndarray, np.ndarray] | None = None,
         reference: np.ndarray | None = None,
     ) -> None:
-        """A plan that waits to be carried out: what it expects (H, L, 13) from a state (L, 13) on.
+        """Show a plan that waits to be executed: its expected states (H, L, 13) from a state (L, 13) on.
 
         fan: other candidates' paths (N, T, 3) [m] of the traced link, and their costs (N,). reference: state (L, 13).
         """
@@ -287,10 +292,10 @@ class LivePage:
     def update(
         self, state: np.ndarray, predicted: np.ndarray | None, time: float, reference: np.ndarray | None = None
     ) -> None:
-        """The truth's state (L, 13) at `time` [s].
+        """Show the state (L, 13) of the ground truth at `time` [s].
 
-        predicted: (H, L, 13) of the model for time, time + dt, ..., if just asked; otherwise None. reference: state
-        (L, 13), if it is to be seen.
+        predicted: (H, L, 13), the model's states at time, time + dt, ..., if they were just predicted; otherwise None.
+        reference: state (L, 13), if it is to be drawn.
         """
         with self._lock:
             if self._stage is None:
@@ -307,7 +312,7 @@ class LivePage:
             self._news.waiting.append(Moment(np.array(state), time, predicted, reference))
 
     def finish(self, recording: Recording, beside: Recording | None = None) -> None:
-        """Offer a recording for play, and another beside it."""
+        """Load a recording for replay, and optionally another to be drawn beside it."""
         with self._lock:
             if self._stage is None or self.offer is None:
                 self.begin(recording.scene, recording.target, recording.traced)
@@ -329,21 +334,21 @@ class LivePage:
             self._mode = "replay"
 
     def tell(self, text: str) -> None:
-        """What is going on, in Markdown."""
+        """Show a status text in Markdown."""
         self._panel.write(f"{text}\n\n{LEGEND}")
 
     @property
     def panel(self) -> Panel:
-        """The controls beside the picture."""
+        """Return the controls beside the picture."""
         return self._panel
 
     @property
     def recording(self) -> Recording | None:
-        """What is being played; None while nothing is."""
+        """Return the recording that is being replayed, or None."""
         return self._recording
 
     def wait(self) -> None:
-        """Leave the page open until it is closed or the user interrupts."""
+        """Keep the page open until it is closed or the user interrupts."""
         try:
             self._closed.wait()
         except KeyboardInterrupt:
@@ -372,7 +377,7 @@ class LivePage:
         while not self._closed.wait(max(0.0, due - clock.monotonic())):
             pace = FRAME * max(1.0, len(self._views) / AT_FULL_PACE)
             if self._mode == "running":
-                self._rests.wait(pace)  # or it would take one of few cores from whoever plans
+                self._rests.wait(pace)  # otherwise it would take one of few cores from the planner
             now = clock.monotonic()
             due = max(due + pace, now + 0.5 * pace)
             with self._lock:
@@ -399,7 +404,7 @@ class LivePage:
         self._frames += 1
 
     def _draw_news(self, stage: Stage, news: News) -> None:
-        """What has changed since it was last drawn; of a plan that waits, the ghost goes on moving."""
+        """Draw what has changed since the last frame; the ghost of a plan that waits keeps moving."""
         news.go_on()
         lane, plan, waits = stage.lane, news.plan, self._mode == "planned"
         if not news.fresh and not (waits and self._panel.playing):
@@ -428,7 +433,7 @@ class LivePage:
     def _welcome(self, client: viser.ClientHandle) -> None:
         self._look(client, "side")
 
-        # The panel, and whoever changes the window, leave more or less of it to the picture.
+        # The panel and the size of the window change the aspect of the picture.
         @client.camera.on_update
         async def _(camera: viser.CameraHandle) -> None:
             view, aspect = self._views.get(client.client_id, ("", 1.0))
@@ -452,11 +457,11 @@ class LivePage:
     def _follow(self, ball: np.ndarray) -> None:
         for number, client in self._server.get_clients().items():
             if self._views.get(number, ("",))[0] == "follow":
-                with client.atomic(), suppress(ValueError):  # of a client whose camera makes no sense
+                with client.atomic(), suppress(ValueError):  # of a client whose camera is invalid
                     client.camera.position, client.camera.look_at = ball + FOLLOWED, ball
 
     def _download(self, client: viser.ClientHandle, kind: str) -> None:
-        """Make a file of the recording that is played, apart from what is drawn, and hand it to one client."""
+        """Make a file of the recording that is replayed, in a thread of its own, and send it to one client."""
         recording, files = self._recording, self.files
         if recording is None or files is None or not self._filing.acquire(blocking=False):
             why = "Kick first." if recording is None else "Another file is being made."
@@ -475,12 +480,12 @@ class LivePage:
 
 
 def aspect_of(camera: viser.CameraHandle) -> float:
-    """Width over height of a client's picture, of any that makes sense."""
+    """Return width over height of a client's picture, clipped to a sensible range."""
     return within(camera.aspect, 0.2, 5.0)
 
 
 def described(recording: Recording) -> str:
-    """A recording in Markdown."""
+    """Return the title and the summary of a recording in Markdown."""
     miss = nearest_approach(recording.path, recording.target).distance
     facts = {"nearest to the target": f"{100.0 * miss:.1f} cm", **recording.summary}
     lines = (f"- {name}: {text}" for name, text in facts.items())

@@ -1,4 +1,4 @@
-"""Where to look from: the nearest place from which all that matters is seen, along one of a few directions."""
+"""Camera placement: the nearest position from which all given points are visible, along one of a few directions."""
 
 from __future__ import annotations
 
@@ -8,20 +8,23 @@ import numpy as np
 
 View = Literal["side", "behind", "goal", "above"]
 VIEWS: tuple[View, ...] = get_args(View)
-# Which way a camera looks: its bearing, from x to the left, and how much it looks down [rad]. From the side, a little
-# from behind; along with the kick; against it.
+# Viewing direction of a camera: its bearing, from x to the left, and its downward tilt [rad]. From the side and
+# slightly from behind; along the kick; against it; from above.
 DIRECTIONS: dict[View, tuple[float, float]] = {
     "side": (1.13, 0.21),
     "behind": (0.21, 0.24),
     "goal": (2.93, 0.17),
     "above": (1.57, 1.22),
 }
-TANGENT = 0.32  # of half the angle of view, across
-MARGIN = 0.4  # m around what must be seen
+TANGENT = 0.32  # of half the horizontal angle of view
+MARGIN = 0.4  # m around points that must be visible
 
 
 class PictureCamera(NamedTuple):
-    """A pinhole. place: (3,) [m]. axes: (3, 3), right, up and forwards in rows. tangent: of half its angle across."""
+    """Pinhole camera.
+
+    place: (3,) [m]. axes: (3, 3), right, up and forwards in rows. tangent: of half its horizontal angle of view.
+    """
 
     place: np.ndarray
     axes: np.ndarray
@@ -29,7 +32,7 @@ class PictureCamera(NamedTuple):
 
     @classmethod
     def of(cls, points: np.ndarray, aspect: float, view: View = "side", tangent: float = TANGENT) -> PictureCamera:
-        """The nearest one that has all of (P, 3) [m] in its picture. aspect: of the picture, height over width."""
+        """Return the nearest camera with all points (P, 3) [m] in its picture, of height over width `aspect`."""
         bearing, down = DIRECTIONS[view]
         forwards = np.array([np.cos(bearing), np.sin(bearing), -np.tan(down)])
         forwards /= np.linalg.norm(forwards)
@@ -48,21 +51,21 @@ class PictureCamera(NamedTuple):
         return cls(place @ axes, axes, tangent)
 
     def depth(self, points: np.ndarray) -> np.ndarray:
-        """How far ahead points (*, 3) are [m]."""
+        """Return the depths [m] of points (*, 3) [m] along the viewing direction."""
         return np.asarray((points - self.place) @ self.axes[2])
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Where points (*, 3) [m] are in the picture, (*, 2), its width from -1 to 1."""
+        """Return the projections (*, 2) of points (*, 3) [m]; the width of the picture is from -1 to 1."""
         seen = (points - self.place) @ self.axes.T
         return np.asarray(seen[..., :2] / (self.tangent * seen[..., 2:]))
 
     def sphere(self, centre: np.ndarray, radius: float) -> tuple[np.ndarray, float]:
-        """Middle (2,) and radius of a sphere in the picture; that it is an ellipse there is not seen."""
+        """Return centre (2,) and radius of a sphere in the picture, as a circle; that it is an ellipse is neglected."""
         return self(centre), radius / (self.tangent * float(self.depth(centre)))
 
 
 def around(*points: np.ndarray) -> np.ndarray:
-    """Points (P, 3) [m], each with `MARGIN` on all sides."""
+    """Return the corners (P, 3) [m] of a cube around each given point, `MARGIN` away from it along each axis."""
     corners = MARGIN * np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     given = np.concatenate([np.reshape(each, (-1, 3)) for each in points])
     return np.asarray((given[:, None] + corners).reshape(-1, 3))

@@ -1,4 +1,4 @@
-"""Values that a browser sends, made safe: any client may send anything, and Viser hands it on."""
+"""Validation of values that a browser sends: any client may send anything, and Viser passes it on unchecked."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ LARGEST = 2.0**53  # of a number in JavaScript that is still exact
 
 
 def within(value: object, low: float, high: float) -> float:
-    """A number brought between bounds; `low` where it is none, or not finite."""
+    """Return a number clipped to [low, high], or `low` if the value is not a finite number."""
     if isinstance(value, int):
         return float(min(max(value, low), high))  # which may be too large for a float
     return min(max(float(value), low), high) if isinstance(value, Real) and math.isfinite(value) else low
 
 
 def vector(value: object, low: Sequence[float], high: Sequence[float]) -> np.ndarray:
-    """A vector (3,) brought into the box from `low` (3,) to `high` (3,), each component as by `within`.
+    """Return a vector (3,) clipped to the box from `low` (3,) to `high` (3,), each component as by `within`.
 
-    The corner `low` where it is no vector of three.
+    If the value is not a vector of three, return the corner `low`.
     """
     value = value.tolist() if isinstance(value, np.ndarray) else value
     parts = value if isinstance(value, tuple | list) and len(value) == len(low) else low
@@ -33,19 +33,20 @@ def vector(value: object, low: Sequence[float], high: Sequence[float]) -> np.nda
 
 
 def option(value: object, offered: Sequence[T]) -> T:
-    """The one of the options offered that this is; the first where it is none."""
+    """Return the offered option that equals the value, in type too, or the first option if none does."""
     return next((each for each in offered if type(each) is type(value) and each == value), offered[0])
 
 
 def flag(value: object) -> bool:
-    """Whether this is true, not only something that counts as true, such as the text "false"."""
+    """Return whether the value is `True` itself, not only truthy, such as the text "false"."""
     return value is True
 
 
 def alike(value: object, current: object) -> bool:
-    """Whether a value just decoded can stand for the current one of a control, be it within its bounds or not.
+    """Return whether a decoded value has the type of a control's current one, be it within its bounds or not.
 
-    A number is finite and exact in JavaScript, a vector as long as it was. Other values are no control's.
+    A number must be finite and exact in JavaScript, a vector as long as the current one. Current values of other types
+    belong to no control: the result is then False.
     """
     match current:
         case bool():

@@ -1,4 +1,4 @@
-"""A kick as a film, mp4 or gif: human, ball and both paths in perspective, slowly up to the target, then as it was."""
+"""Film of a kick, mp4 or gif: human, ball and both paths in perspective, slow up to the target, then in real time."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ from viewer.recording import Approach, Recording, nearest_approach
 from viewer.scene_view import BALL_PATCHES, PREDICTION, TARGET, TRUTH, Colour, football_meshes, link_colour
 
 SUFFIXES = (".mp4", ".gif")
-SLOW = 0.25  # of its speed, up to the target
-LINGER = 0.1  # s for which it stays slow beyond
+SLOW = 0.25  # playback speed up to the target, as a fraction of real time
+LINGER = 0.1  # s after the closest approach during which playback stays slow
 DOTS = 100  # per inch
 NEAR, FAR = 0.5, 20.0  # m, between which the ground is drawn
-LIGHT = np.array([0.25, -0.45, -1.0])  # the way it falls
+LIGHT = np.array([0.25, -0.45, -1.0])  # direction in which light falls
 SKY, GROUND, LINES, SHADOW, INK, QUIET = "#ffffff", "#f3f5f7", "#d5dae0", "#dde1e6", "#22262c", "#5b6470"
 CIRCLE = np.stack([np.cos(np.linspace(0, 2 * np.pi, 40)), np.sin(np.linspace(0, 2 * np.pi, 40))], axis=-1)
 
 
 def check_film(path: str | Path) -> None:
-    """Refuses, at once, a path that no film can be written to."""
+    """Raise InputError if no film can be written to a path: wrong suffix, or mp4 without an encoder."""
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
         raise InputError(f"video is {str(path)!r}, but its name must end in {' or '.join(SUFFIXES)}")
@@ -49,7 +49,7 @@ def check_film(path: str | Path) -> None:
 
 
 def write_film(recording: Recording, path: str | Path, size: tuple[int, int] = (1280, 720), rate: float = 30.0) -> None:
-    """Write a film of (width, height) pixels and so many pictures a second; see `check_film`."""
+    """Write a film to a path. size: (width, height) [pixels]. rate: frames per second. Raises as `check_film` does."""
     check_film(path)
     pictures = frames(recording, size, rate)
     if Path(path).suffix.lower() == ".gif":
@@ -79,7 +79,7 @@ def write_film(recording: Recording, path: str | Path, size: tuple[int, int] = (
 
 
 def frames(recording: Recording, size: tuple[int, int] = (1280, 720), rate: float = 30.0) -> Iterator[np.ndarray]:
-    """The pictures (height, width, 3) of a film, 0 to 255."""
+    """Yield the frames (height, width, 3) of a film, with values from 0 to 255."""
     approach = nearest_approach(recording.path, recording.target)
     camera = PictureCamera.of(_seen(recording, approach), size[1] / size[0])
     across = size[1] / size[0]
@@ -100,20 +100,20 @@ def frames(recording: Recording, size: tuple[int, int] = (1280, 720), rate: floa
 
 
 def _cleared(axes: Axes) -> None:
-    """Take away all that was drawn; the axes stay, which take longer to make than a picture."""
+    """Remove everything drawn but keep the axes, which take longer to create than a frame."""
     for artist in (*axes.collections, *axes.lines, *axes.patches, *axes.texts):
         artist.remove()
 
 
 def _times(recording: Recording, approach: Approach, rate: float) -> Iterator[float]:
-    """The moments [s] of the film's pictures."""
+    """Yield the times [s] in the recording of the film's frames."""
     slow = min(approach.row * recording.scene.dt + LINGER, recording.duration)
     yield from np.arange(0.0, slow, SLOW / rate)
     yield from np.arange(slow, recording.duration, 1.0 / rate)
 
 
 def _seen(recording: Recording, approach: Approach) -> np.ndarray:
-    """Points (P, 3) [m] that the camera must have in its picture: the human's, and the ball's up to the target."""
+    """Return points (P, 3) [m] that the camera must see: those of the human, and of the ball up to the target."""
     ball = recording.traced % len(recording.scene.links)
     links = np.delete(recording.states[::5], ball, axis=1)[..., POSITION].reshape(-1, 3)
     way = recording.path[: approach.row + 2]
@@ -121,7 +121,7 @@ def _seen(recording: Recording, approach: Approach) -> np.ndarray:
 
 
 def _ground(axes: Axes, camera: PictureCamera) -> None:
-    """A grid of metres that fades away; it never moves, so that it is drawn once."""
+    """Draw the ground, a metre grid that fades with distance; it never moves and is drawn only once."""
     horizon = float(camera(camera.place + 1e4 * (camera.axes[2] * (1.0, 1.0, 0.0)))[1])
     axes.axhspan(-1.0, horizon, color=GROUND, zorder=0)
     middle = np.round(camera.place + 0.5 * FAR * camera.axes[2])
@@ -139,7 +139,7 @@ def _ground(axes: Axes, camera: PictureCamera) -> None:
 
 
 def _scene(axes: Axes, camera: PictureCamera, recording: Recording, approach: Approach, time: float) -> None:
-    """All that moves, at a time [s]."""
+    """Draw everything that changes between frames, at a time [s] of the recording."""
     dt, target = recording.scene.dt, np.asarray(recording.target, float)
     row = min(int(time / dt), len(recording.states) - 1)
     state, traced = recording.states[row], recording.traced % len(recording.scene.links)
@@ -164,7 +164,7 @@ def _scene(axes: Axes, camera: PictureCamera, recording: Recording, approach: Ap
     for way, colour, style, width in ways:
         seen = way[camera.depth(way) > NEAR]
         axes.plot(*camera(seen).T, color=_rgb(colour), ls=style, lw=width, zorder=2, solid_capstyle="round")
-    # The ball is drawn where it is among the links: behind those that are nearer.
+    # The ball is drawn in order of depth: behind links that are nearer to the camera.
     far = camera.depth(state[traced, POSITION])
     order = sorted(links, key=lambda each: -each[0])
     for layer, (depth, (outline, colour, lit)) in enumerate(order):
@@ -205,7 +205,7 @@ def _scene(axes: Axes, camera: PictureCamera, recording: Recording, approach: Ap
 
 
 def _ball(axes: Axes, camera: PictureCamera, state: np.ndarray, radius: float) -> None:
-    """A white disc, and of its dark patches those that face the camera."""
+    """Draw the ball as a white disc with those of its dark patches that face the camera."""
     centre = state[POSITION]
     middle, size = camera.sphere(centre, radius)
     _disc(axes, middle, size, fc=_rgb(BALL_PATCHES[0]), ec=INK, lw=1.2, zorder=3.8)
@@ -219,13 +219,13 @@ def _ball(axes: Axes, camera: PictureCamera, state: np.ndarray, radius: float) -
 
 
 def _hull(camera: PictureCamera, ends: np.ndarray, radius: float) -> np.ndarray:
-    """The outline (P, 2) of a capsule between ends (2, 3) [m] in the picture."""
+    """Return the outline (P, 2), in the picture, of a capsule between ends (2, 3) [m]."""
     discs = [camera.sphere(end, radius) for end in ends]
     return _wrapped(np.concatenate([middle + size * CIRCLE for middle, size in discs]))
 
 
 def _shadow(camera: PictureCamera, ends: np.ndarray, radius: float) -> np.ndarray:
-    """The outline (P, 2), in the picture, of what a capsule keeps from the ground."""
+    """Return the outline (P, 2), in the picture, of the shadow that a capsule casts on the ground."""
     on_ground = ends + np.maximum(ends[:, 2:], 0.0) * LIGHT
     discs = np.concatenate([end[:2] + radius * CIRCLE for end in on_ground])
     return _wrapped(camera(np.pad(discs, ((0, 0), (0, 1)))))

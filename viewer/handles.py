@@ -1,4 +1,4 @@
-"""What is dragged in the picture: the target, the resting ball's spot, and how it rolls."""
+"""Draggable handles in the picture: for the target, the spot of the ball, and its rolling velocity."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from viewer.checked import vector
 from viewer.wishes import Offer
 
 SIZE = 0.45  # m, of a handle's arrows
-LEAD = 0.3  # s: an arrow ends where the ball would be so much later
-# The handle of how the ball rolls floats so far above where the arrow ends [m], out of the way of the spot's.
+LEAD = 0.3  # s: an arrow ends where the ball would be after this time
+# Offset [m] of the handle of the rolling velocity from the end of the arrow, clear of the handle of the spot.
 ABOVE = np.array([0.0, 0.0, 0.35])
 ROLLING, FAINT = (204, 121, 167), (140, 190, 170)
 
 
 class Handles:
-    """Of one page, all its clients together; every value is brought within what is offered."""
+    """Handles of one page, shared by all its clients; every value is clipped to the box that is offered."""
 
     def __init__(
         self,
@@ -29,7 +29,10 @@ class Handles:
         ball: np.ndarray,
         changed: Callable[[], None],
     ) -> None:
-        """target: (3,) [m], where it is at first. ball: (3,) [m], where the ball usually lies. changed: see `Panel`."""
+        """Add the handles to the scene.
+
+        target: (3,) [m], its initial position. ball: (3,) [m], usual position of the ball. changed: see `Panel`.
+        """
         self._server, self._offer, self._ball, self._changed = server, offer, np.asarray(ball, float), changed
         self.target: tuple[float, ...] = tuple(map(float, target))
         self.spot: tuple[float, ...] = (0.0, 0.0)
@@ -56,7 +59,7 @@ class Handles:
         return handle
 
     def _take(self, name: str, place: np.ndarray) -> None:
-        """Where a handle has been dragged to."""
+        """Set the value that belongs to a handle from the position (3,) [m] to which it was dragged."""
         offer = self._offer
         if name == "target":
             self.target = tuple(map(float, vector(place, *offer.target)))
@@ -71,7 +74,7 @@ class Handles:
         return tuple(map(float, vector(value, (*box[0], 0.0), (*box[1], 0.0))[:2]))
 
     def _settle(self) -> None:
-        """Put the handles where they count: those dragged out of what is offered come back to its edge."""
+        """Move the handles to their values: those dragged out of the box that is offered return to its edge."""
         resting = self.resting
         with self._server.atomic():
             self._target.position = np.array(self.target)
@@ -80,7 +83,7 @@ class Handles:
         self._arrow()
 
     def _arrow(self) -> None:
-        """How the ball rolls, as an arrow; none where it rests."""
+        """Draw the rolling velocity of the ball as an arrow, or none below 0.1 m/s."""
         begin = self.resting
         end = begin + LEAD * np.array((*self.roll, 0.0))
         if np.linalg.norm(self.roll) < 0.1:
@@ -90,7 +93,7 @@ class Handles:
             self._server.scene.add_arrows("/handles/rolling", points, ROLLING)
 
     def _hint(self) -> None:
-        """What can be reached, as an outline on the ground."""
+        """Draw on the ground the outline of the box that is offered for the target."""
         (low_x, low_y, _), (high_x, high_y, _) = self._offer.target
         corners = np.array([(low_x, low_y), (high_x, low_y), (high_x, high_y), (low_x, high_y)])
         ring = np.concatenate([corners, np.full((4, 1), 0.01)], axis=1)
@@ -99,16 +102,16 @@ class Handles:
 
     @property
     def resting(self) -> np.ndarray:
-        """Where the ball is (3,) [m]."""
+        """Return the initial position (3,) [m] of the ball as it is set by its handle."""
         return self._ball + np.array((*self.spot, 0.0))
 
     def aim(self, target: Sequence[float] | np.ndarray) -> None:
-        """Put the target (3,) [m] where it is wanted, as if it had been dragged."""
+        """Move the target to (3,) [m], clipped to the box that is offered, as if it had been dragged."""
         self._take("target", np.asarray(target, float))
         self._settle()
 
     def shown(self, visible: bool) -> None:
-        """Show them all, or only the target."""
+        """Show all handles, or only that of the target."""
         for handle in (self._spot, self._roll):
             handle.visible = visible
         if visible:

@@ -1,7 +1,8 @@
-"""A motion found in a film, as one HTML file: the human in 3D, and over it the keypoints as the camera saw them.
+"""HTML file of a motion reconstructed from a film: the human in 3D and, over it, the keypoints of the images.
 
-A keypoint is drawn on its ray, a little before what was found: from the film's camera, where the page begins, it lies
-where the image has it, and a line says how far off the point is that it belongs to.
+A keypoint is drawn on its camera ray, a little in front of the reconstructed human: seen from the film's camera, the
+initial view of the page, it lies where the image has it, and a line to its point on the human shows the reprojection
+error.
 """
 
 from __future__ import annotations
@@ -26,11 +27,12 @@ LEGEND = "in colour: executed, grey: kinematic start, red: keypoints, and how fa
 
 @dataclass(frozen=True, eq=False)
 class Overlay:
-    """What is laid over each other, in the world frame.
+    """Motions and keypoints that are drawn over each other, in the world frame.
 
-    states, start: (T, L, 13) every `scene.dt`, executed and before physics. seen, found: (F, P, 3) [m] at `rate` frames
-    a second, keypoints on their rays, NaN where there are none, and beside them the points that they belong to.
-    camera: where it stands (3,) and a point (3,) it looks at [m]. field_of_view: from top to bottom [rad].
+    states, start: (T, L, 13) every `scene.dt`, the executed motion and the kinematic one before physics. seen, found:
+    (F, P, 3) [m] at `rate` frames a second, keypoints on their rays, NaN if there are none, and next to them the points
+    of the human that they belong to. camera: its position (3,) and a point (3,) it looks at [m]. field_of_view: from
+    top to bottom [rad].
     """
 
     scene: Scene
@@ -53,14 +55,14 @@ class Overlay:
             raise InputError(f"seen and found have shapes {np.shape(self.seen)} and {np.shape(self.found)}, not one")
 
     def at(self, row: int) -> np.ndarray:
-        """Keypoints and their points on the human (K, 2, 3) [m] of the frame nearest to a row of the states."""
+        """Return keypoints and their points on the human (K, 2, 3) [m], of the frame nearest to a row of the states."""
         frame = min(round(row * self.scene.dt * self.rate), len(self.seen) - 1)
         pairs = np.stack([self.seen[frame], self.found[frame]], axis=1)
         return pairs[np.isfinite(pairs).all(axis=(1, 2))].astype(np.float32)
 
 
 def overlay_page(overlay: Overlay) -> str:
-    """The page's HTML."""
+    """Return the page as HTML."""
     server, scene = open_server(port=0), overlay.scene
     try:
         with server.atomic():
@@ -89,5 +91,5 @@ def overlay_page(overlay: Overlay) -> str:
 
 
 def write_overlay(overlay: Overlay, path: str | Path) -> None:
-    """Write the page."""
+    """Write the page to an HTML file."""
     write_whole(path, overlay_page(overlay).encode())

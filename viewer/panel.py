@@ -1,6 +1,6 @@
-"""What is beside the picture: controls of the kick, weights of its costs, figures, and the replay's clock.
+"""Panel beside the picture: controls of the kick, weights of its costs, figures, and the clock of the replay.
 
-Everything that comes from a browser is checked here, before anyone else sees it.
+All values that come from a browser are validated here before they are used elsewhere.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from viewer.checked import flag, option, within
 from viewer.wishes import Offer
 
 SPEEDS = (0.05, 2.0)
-# What a key asks for: its name, what the button says, the key.
+# Actions with a key: name, label of the button, key.
 ACTIONS = (("kick", "Kick", "K"), ("reset", "Reset", "R"), ("play", "Play / pause", "space"), ("step", "Step", "S"))
 GHOSTS = ("prediction", "reference", "fan")
 FILES = ("html", "png", "gif")
-# A cost's weight goes up to so many times what it is at first.
+# Upper bound of a cost's weight, as a multiple of its initial one.
 HEAVIEST = 5.0
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#333333")
-LEAST = 1e-6  # a cost below has no place on a logarithmic axis
+LEAST = 1e-6  # lower bound of costs on a logarithmic axis
 ABOUT = """Drag the green target, then **Kick** (key K). The model plans, MuJoCo carries out.
 
 The ball has two handles: where it lies and, above it, how it rolls.
@@ -35,12 +35,19 @@ Asked = Callable[[str, "viser.ClientHandle | None"], None]
 
 
 class Panel:
-    """Its time slider is the clock of a replay: the page draws what the slider says, whoever moved it."""
+    """Controls beside the picture.
+
+    The time slider is the clock of a replay: the page draws the time that it shows, whoever moved it.
+    """
 
     def __init__(
         self, gui: viser.GuiApi, asked: Asked, changed: Callable[[], None], offer: Offer | None = None
     ) -> None:
-        """asked: called with the name of what a client asks for. changed: called when a setting has."""
+        """Add the controls to a page.
+
+        asked: called with the name of the action that a client requests, and the client. changed: called when a
+        setting has changed.
+        """
         self._gui, self._asked, self._changed, self._offer = gui, asked, changed, offer
         gui.configure_theme(show_share_button=False, show_logo=False)
         gui.set_panel_label("LARP-MPC")
@@ -67,21 +74,21 @@ class Panel:
                 self._kept()
         self._looks()
         if offer:
-            # A plot that is made where it cannot be seen has no width: so no tab.
+            # Not in a tab: a plot that is created while hidden has no width.
             self._folder = gui.add_folder("Figures")
             with self._folder:
                 self._figures = gui.add_markdown("What kicks come to.")
         self.watch()
 
     def _button(self, label: str, name: str) -> None:
-        """A button that asks for something by name."""
+        """Add a button that requests an action by name."""
 
         @self._gui.add_button(label).on_click
         async def _(event: viser.GuiEvent) -> None:
             self._asked(name, event.client)
 
     def _group(self, label: str, names: Mapping[str, str]) -> None:
-        """Buttons in a row, each of which asks for something, by what is written on it."""
+        """Add a row of buttons that request actions. names: from the text on a button to the name of its action."""
         group = self._gui.add_button_group(label, tuple(names))
 
         @group.on_click
@@ -89,14 +96,14 @@ class Panel:
             self._asked(names[option(group.value, tuple(names))], event.client)
 
     def _key(self, label: str, name: str, key: str) -> None:
-        """A key that asks for something by name."""
+        """Add a keyboard shortcut that requests an action by name."""
 
         @self._gui.add_command(label, hotkey=key).on_trigger  # type: ignore[arg-type]
         async def _(event: viser.CommandEvent) -> None:
             self._asked(name, event.client)
 
     def _setting(self, name: str, handle: Any) -> None:
-        """Keep a control by name; whenever it changes, the settings have."""
+        """Register a control by name; whenever it changes, `changed` is called."""
         self._settings[name] = handle
 
         @handle.on_update
@@ -126,7 +133,7 @@ class Panel:
         self._key("Push the ball", "push ball", "B")
 
     def _weights(self, offer: Offer) -> None:
-        """A slider for each named cost, built from the cost's own weight."""
+        """Add a slider for the weight of each named cost, with a range relative to its initial weight."""
         self._gui.add_markdown("Weights of the named costs; they count from the next plan on.")
         for name, weight in offer.terms:
             handle = self._gui.add_slider(name, 0.0, HEAVIEST * weight, HEAVIEST * weight / 100.0, weight)
@@ -163,7 +170,7 @@ class Panel:
 
     @property
     def playing(self) -> bool:
-        """Whether time goes on."""
+        """Return whether time runs, that is, whether it is not paused."""
         return self._playing
 
     @playing.setter
@@ -172,16 +179,16 @@ class Panel:
 
     @property
     def speed(self) -> float:
-        """Of the motion, as a share of its own."""
+        """Return the playback speed, as a fraction of real time."""
         return within(self._speed.value, *SPEEDS)
 
     @property
     def ghosts(self) -> set[str]:
-        """Which of `GHOSTS` are to be seen."""
+        """Return the names out of `GHOSTS` that are to be drawn."""
         return {name for name, handle in self._ghosts.items() if flag(handle.value)}
 
     def asked_for(self) -> dict[str, Any]:
-        """Those of `Wishes` that are set here, all within what is offered."""
+        """Return the fields of `Wishes` that are set on the panel, all within the offer."""
         offer = self._offer
         assert offer is not None
         names = {"preset": offer.presets, "dynamics": offer.dynamics}
@@ -192,39 +199,42 @@ class Panel:
         return found
 
     def as_at_first(self) -> None:
-        """Give the costs their own weights again."""
+        """Reset the weights of the costs to their initial values."""
         assert self._offer is not None
         for name, weight in self._offer.terms:
             self._terms[name].value = weight
 
     def push(self) -> tuple[float, ...]:
-        """The change of velocity (3,) [m/s] that is set."""
+        """Return the change of velocity (3,) [m/s] set for a push."""
         assert self._offer is not None
         return tuple(within(each.value, -self._offer.push, self._offer.push) for each in self._push)
 
     def kept(self, names: Sequence[str]) -> None:
-        """Offer kept kicks to be opened, the last one first."""
+        """Set the names of saved kicks that can be opened, latest first."""
         self._saved.options = tuple(names) or ("none yet",)
 
     def chosen(self, names: Sequence[str]) -> str | None:
-        """The kept kick that is chosen; None where there is none."""
+        """Return the name of the saved kick that is chosen, or None if there are none."""
         return option(self._saved.value, names) if names else None
 
     def write(self, text: str) -> None:
-        """Show a text in Markdown."""
+        """Show a Markdown text above the controls."""
         if self._text.content != text:
             self._text.content = text
 
     def figures(self, text: str) -> None:
-        """Show figures in Markdown."""
+        """Show a Markdown text in the folder of figures."""
         self._figures.content = text
 
     def plot(self, name: str, series: Mapping[str, Sequence[float]], across: str) -> None:
-        """Draw values (T,) by name on a logarithmic axis, over 1 ... T, in the figures."""
+        """Plot named series of values (T,) on a logarithmic axis, over 1 ... T, in the folder of figures.
+
+        name: title of the plot; a plot that exists is updated. across: label of the horizontal axis.
+        """
         count = max((len(values) for values in series.values()), default=0)
         if count < 2:
             return
-        # What is not finite leaves a gap: it is no small value.
+        # Values that are not finite leave a gap, for they are not small.
         rows = [
             np.where(np.isfinite(each), np.maximum(each, LEAST), np.nan) for each in map(np.asarray, series.values())
         ]
@@ -246,11 +256,11 @@ class Panel:
             )
 
     def watch(self) -> None:
-        """Hide the clock: what is drawn comes from outside."""
+        """Hide the clock of the replay, which live states do not use."""
         self._time.visible = False
 
     def play(self, duration: float, step: float) -> None:
-        """Offer the controls for a recording of that duration, with a state every `step` [s]."""
+        """Show the clock for a recording of this duration [s] with a state every `step` [s], and start at 0."""
         self._duration = duration
         self._time.max, self._time.step = max(duration, step), step
         self._set_time(0.0)
@@ -258,15 +268,15 @@ class Panel:
 
     @property
     def time(self) -> float:
-        """Of the recording [s]."""
+        """Return the time in the recording [s] that the slider shows."""
         return within(self._time.value, 0.0, self._duration)
 
     def move(self, elapsed: float) -> None:
-        """Move the clock by so many seconds, within the recording."""
+        """Move the clock by `elapsed` seconds, clipped to the recording."""
         self._set_time(min(max(self.time + elapsed, 0.0), self._duration))
 
     def advance(self, elapsed: float) -> float:
-        """The time in the recording [s], `elapsed` seconds after the last call; it starts over at the end."""
+        """Return the time in the recording [s], `elapsed` seconds after the last call; it starts over at the end."""
         time = self.time
         if self._playing:
             time += elapsed * self.speed

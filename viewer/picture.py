@@ -1,4 +1,4 @@
-"""A kick in one picture: its motion in a few frames, the ball's paths from above and beside, the costs."""
+"""Picture of a kick: its motion in a few frames, the paths of the ball from above and from the side, the costs."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from viewer.recording import Recording, nearest_approach
 from viewer.scene_view import PREDICTION, TARGET, TRUTH, Colour, link_colour
 
 WIDTH, HEIGHT, DOTS = 18.0, 10.0, 100  # inches, inches, dots per inch
-TILE = 2.1  # m of the strip for each frame
+TILE = 2.1  # m, width of a frame in the strip
 # Seconds from contact to each frame but the first.
 FRAMES = {"backswing": -0.14, "contact": 0.0, "launch": 0.04, "follow-through": 0.25, "recovery": 0.7}
 STRUCK = 0.5  # m/s, speed from which the traced link counts as struck
-FACTS = 4  # in a line below the title
-DECADES = 6  # how far the axis of costs reaches below the greatest
+FACTS = 4  # entries of the summary per line below the title
+DECADES = 6  # that the axis of costs reaches below the greatest
 # After Okabe and Ito, safe for all eyes.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 QUIET = "#5b6470"
 
 
 def kick_picture(recording: Recording, costs: Mapping[str, Sequence[float]] | None, path: str | Path) -> None:
-    """Write a PNG of 1800 x 1000 pixels. costs: of each term, its share of the plan's cost at each replan."""
+    """Write a PNG of 1800 x 1000 pixels. costs: by name of a cost term, its part of the plan's cost at each replan."""
     terms = {name: shown for name, values in (costs or {}).items() if not np.isnan(shown := _shown(values)).all()}
     figure = Figure((WIDTH, HEIGHT), DOTS, facecolor="white")
     canvas = FigureCanvasAgg(figure)
@@ -56,7 +56,7 @@ def kick_picture(recording: Recording, costs: Mapping[str, Sequence[float]] | No
 
 
 def _strip(axes: Axes, recording: Recording) -> None:
-    """The scene from its right-hand side at a few moments, the root of its first body amid each."""
+    """Draw the scene from its right-hand side at a few times, each frame centred on the root of its first body."""
     rows = _moments(recording)
     for tile, (row, name) in enumerate(rows.items()):
         state = recording.states[row]
@@ -87,7 +87,7 @@ def _strip(axes: Axes, recording: Recording) -> None:
 
 
 def _moments(recording: Recording) -> dict[int, str]:
-    """Rows worth seeing, and what they are called: around contact, or evenly spread where there is none."""
+    """Return rows to draw, with their names: around contact, or evenly spread and unnamed if there is none."""
     last = len(recording.states) - 1
     speed = np.linalg.norm(recording.states[:, recording.traced, VELOCITY], axis=-1)
     contact = int(np.argmax(speed > STRUCK))
@@ -110,7 +110,7 @@ def _bodies(axes: Axes, scene: Scene, state: np.ndarray, shift: np.ndarray, tile
 
 
 def _outline(axes: Axes, scene: Scene, state: np.ndarray, shift: np.ndarray, colour: str) -> None:
-    """The contour of all bodies but balls: thick edges first, then white over what of them lies within."""
+    """Draw the contour of all bodies but balls: thick edges, then white areas over the edges that lie inside."""
     for row in set(range(len(scene.links))) - _balls(scene):
         contour = _capsule(scene, state, row) + shift
         axes.add_patch(Polygon(contour, facecolor="none", edgecolor=colour, lw=3.0, zorder=1))
@@ -122,7 +122,7 @@ def _balls(scene: Scene) -> set[int]:
 
 
 def _capsule(scene: Scene, state: np.ndarray, row: int, points: int = 24) -> np.ndarray:
-    """The contour (P, 2) [m] of a link in the x-z plane."""
+    """Return the contour (P, 2) [m] of a link in the x-z plane."""
     link = scene.links[row]
     along = Rotation.from_quat(state[row, ORIENTATION], scalar_first=True).apply(link.axis)[[0, 2]]
     turn = np.arctan2(along[1], along[0]) + np.linspace(-0.5 * np.pi, 0.5 * np.pi, points)
@@ -132,7 +132,10 @@ def _capsule(scene: Scene, state: np.ndarray, row: int, points: int = 24) -> np.
 
 
 def _paths(above: Axes, beside: Axes, recording: Recording) -> None:
-    """Both paths over the distance towards the target, to one scale: sideways offset above, height below."""
+    """Draw both paths over the distance towards the target, to one scale.
+
+    above, beside: axes for the sideways offset and for the height.
+    """
     start, target = recording.path[0], np.asarray(recording.target, float)
     ahead = (target - start)[:2]
     distance = float(np.linalg.norm(ahead))
@@ -184,13 +187,13 @@ def _paths(above: Axes, beside: Axes, recording: Recording) -> None:
 
 
 def _shown(values: Sequence[float]) -> np.ndarray:
-    """Costs with gaps where they are zero or infinite, which has no place on a logarithmic axis."""
+    """Return costs, with NaN for those not positive or not finite, which a logarithmic axis cannot show."""
     given = np.asarray(values, float)
     return np.where((given > 0.0) & np.isfinite(given), given, np.nan)
 
 
 def _costs(axes: Axes, terms: Mapping[str, np.ndarray]) -> None:
-    """The terms over the replans, as `_shown`."""
+    """Plot the cost terms, as `_shown` returns them, over the replans."""
     for (name, shown), colour, marker in zip(terms.items(), cycle(PALETTE), cycle("osD^vP"), strict=False):
         axes.plot(np.arange(1, len(shown) + 1), shown, color=colour, marker=marker, ms=4, lw=1.5, label=name)
     greatest = max(float(np.nanmax(shown)) for shown in terms.values())

@@ -1,4 +1,4 @@
-"""What a kick left behind, for whoever draws it; and files that appear whole or not at all."""
+"""Recording of an executed kick, and the closest approach of its path to a target."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mpc.cost import nearest_on_path
 
 
 class Approach(NamedTuple):
-    """Where a path comes nearest to a target."""
+    """Closest approach of a path to a target."""
 
     distance: float  # m
     point: np.ndarray  # (3,) m, on the path
@@ -24,7 +24,7 @@ class Approach(NamedTuple):
 
 
 def nearest_approach(path: np.ndarray, target: np.ndarray) -> Approach:
-    """Where a path (T, 3) [m] passes nearest to `target` (3,) [m]; see `mpc.nearest_on_path`."""
+    """Return the closest approach of a path (T, 3) [m] to `target` (3,) [m]; see `mpc.nearest_on_path`."""
     path, target = np.asarray(path, float), np.asarray(target, float)
     if path.ndim != 2 or path.shape[1] != 3 or not len(path):
         raise InputError(f"path has shape {path.shape}, but needs (T, 3) with at least one point")
@@ -33,7 +33,10 @@ def nearest_approach(path: np.ndarray, target: np.ndarray) -> Approach:
 
 
 def known(predicted: np.ndarray, traced: int = -1) -> np.ndarray:
-    """Predicted states (T, L, 13), NaN where all links but the traced only repeat the last that was worked out."""
+    """Return states (T, L, 13), NaN for links but the traced after the last row in which any of these links moves.
+
+    Beyond that row their states were not predicted: they only repeat the last ones.
+    """
     found = np.array(predicted, float)
     others = np.arange(found.shape[1]) != traced % found.shape[1]
     moves = (found[1:, others] != found[:-1, others]).any(axis=(1, 2))
@@ -44,12 +47,12 @@ def known(predicted: np.ndarray, traced: int = -1) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A motion in the truth, and what was expected of it.
+    """Motion in the ground truth, with the model's prediction and the reference.
 
-    states: (T, L, 13) of the truth, row k at the time k `scene.dt`.
+    states: (T, L, 13) of the ground truth, row k at the time k `scene.dt`.
     target: (3,) [m], where the traced link should pass.
-    predicted: (T', L, 13) of the model, its row 0 at the truth's row `predicted_start`.
-    reference: (T'', L, 13), from the truth's row 0 on.
+    predicted: (T', L, 13) of the model, its row 0 at row `predicted_start` of the ground truth.
+    reference: (T'', L, 13), from row 0 of the ground truth on.
     summary: what to print beside the motion, with units, e.g. {"ball speed": "11.2 m/s"}.
     traced: row in the state of the link whose path is drawn; by default the last, the ball.
     """
@@ -85,22 +88,22 @@ class Recording:
 
     @property
     def duration(self) -> float:
-        """Time from the first to the last state [s]."""
+        """Return the time from the first to the last state [s]."""
         return (len(self.states) - 1) * self.scene.dt
 
     @property
     def path(self) -> np.ndarray:
-        """(T, 3) [m], where the traced link went in the truth."""
+        """Return the path (T, 3) [m] of the traced link in the ground truth."""
         return np.asarray(self.states)[:, self.traced, POSITION]
 
     @property
     def predicted_path(self) -> np.ndarray | None:
-        """(T', 3) [m], where the model expected it to go."""
+        """Return the path (T', 3) [m] of the traced link that the model predicted, or None."""
         return None if self.predicted is None else np.asarray(self.predicted)[:, self.traced, POSITION]
 
     @property
     def radius(self) -> float:
-        """Radius of the traced link [m]."""
+        """Return the radius of the traced link [m]."""
         return self.scene.links[self.traced].radius
 
     @cached_property
@@ -108,14 +111,17 @@ class Recording:
         return None if self.predicted is None else known(self.predicted, self.traced)
 
     def predicted_at(self, row: int) -> np.ndarray | None:
-        """The state (L, 13) that the model expected at a row of the truth, NaN where it looked no further; or None."""
+        """Return the state (L, 13) predicted for a row of the ground truth, or None.
+
+        It is NaN for links that were not predicted so far ahead.
+        """
         index = row - self.predicted_start
         if self._known is None or not 0 <= index < len(self._known):
             return None
         return np.asarray(self._known[index])
 
     def reference_at(self, row: int) -> np.ndarray | None:
-        """The reference's state (L, 13) at a row of the truth; None beyond its end."""
+        """Return the reference's state (L, 13) at a row of the ground truth, or None beyond its end."""
         if self.reference is None or row >= len(self.reference):
             return None
         return np.asarray(self.reference[row])

@@ -1,4 +1,4 @@
-"""A recording as one HTML file that plays by itself, without a server and without the network."""
+"""Replay of a recording as one HTML file that plays without a server and without a network."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from viewer.recording import Recording
 from viewer.server import close_server, open_server
 from viewer.stage import LEGEND, Stage, whole
 
-FRAME = 0.02  # s of recorded time between two pictures
+FRAME = 0.02  # s of recorded time between two frames
 
 _CAPTION = """<div style="position:fixed;z-index:1;right:1em;top:1em;max-width:28em;padding:.6em .9em;
 font:14px/1.5 system-ui,sans-serif;color:#222;background:#fffc;pointer-events:none">{}</div>"""
 
 
 def write_html(recording: Recording, path: str | Path) -> None:
-    """Write the page: truth, prediction as a ghost, both paths, target, and the summary in a corner."""
+    """Write the page: ground truth, prediction as a ghost, both paths, target, and the summary in a corner."""
     write_whole(path, page_of(recording).encode())
 
 
 def framed(recording: Recording, height: int = 480) -> str:
-    """The page as a part of another, of a notebook for instance."""
+    """Return the page as an HTML frame to embed in another page, for instance a notebook. height [pixels]."""
     return f'<iframe srcdoc="{escape(page_of(recording))}" width="100%" height="{height}" frameborder="0"></iframe>'
 
 
 def page_of(recording: Recording) -> str:
-    """The page's HTML."""
+    """Return the page as HTML."""
     server = open_server(port=0)
     try:
         stage = Stage(server, recording.scene, recording.target, recording.traced)
@@ -50,7 +50,10 @@ def page_of(recording: Recording) -> str:
 
 
 def played(server: viser.ViserServer, rows: int, dt: float, show: Callable[[int], None]) -> str:
-    """HTML in which a server's scene plays, as `show` sets it for some of the rows of a motion, one every `dt` [s]."""
+    """Return HTML that plays a server's scene, set by `show` for every n-th row of a motion with a row per `dt` [s].
+
+    n is such that frames are about `FRAME` apart.
+    """
     film, stride = server.get_scene_serializer(), max(1, round(FRAME / dt))
     for row in range(0, rows, stride):
         show(row)
@@ -59,7 +62,7 @@ def played(server: viser.ViserServer, rows: int, dt: float, show: Callable[[int]
 
 
 def captioned(page: str, title: str, lines: list[str]) -> str:
-    """The page with its title, and these lines in a corner."""
+    """Return the page with a title, and with the title and these lines in a corner."""
     title = escape(title)
     caption = "<br>".join([f"<b>{title}</b>", *map(escape, lines)])
     head, _, rest = page.partition("<title>")

@@ -1,4 +1,4 @@
-"""The links of a scene as meshes in Viser, moved by packed states."""
+"""Meshes in Viser for the links of a scene, moved by packed states."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ TRUTH, PREDICTION, TARGET, REFERENCE = (213, 94, 0), (0, 114, 178), (0, 158, 115
 
 
 def link_colour(link: Link) -> Colour:
-    """The colour of a link by the side of the body that its name tells."""
+    """Return the colour of a link, by the side of the body that its name begins with."""
     return LEFT if link.name.startswith("left") else RIGHT if link.name.startswith("right") else TRUNK
 
 
 def weld(triangles: np.ndarray) -> Mesh:
-    """The mesh of triangles (F, 3, 3) [m]: corners shared, so that it shades smoothly; no empty ones."""
+    """Return the mesh of triangles (F, 3, 3) [m], with shared corners for smooth shading, without degenerate ones."""
     corners = np.round(triangles.reshape(-1, 3), 9) + 0.0
     vertices, faces = np.unique(corners, axis=0, return_inverse=True)
     faces = faces.reshape(-1, 3)
@@ -40,7 +40,10 @@ def weld(triangles: np.ndarray) -> Mesh:
 
 @cache
 def unit_meshes(sides: int = 24) -> tuple[Mesh, Mesh]:
-    """A ball of radius 1 m, and an open tube along z of radius and length 1 m: scaled and joined, any capsule."""
+    """Return a ball of radius 1 m and an open tube along z of radius and length 1 m.
+
+    Scaled and joined, they make up any capsule.
+    """
     ball = uv_sphere(1.0, count=(sides // 2, sides))
     tube = revolve(np.array([(1.0, -0.5), (1.0, 0.5)]), sections=sides)
     as_mesh = [(each.vertices.astype(np.float32), each.faces.astype(np.uint32)) for each in (ball, tube)]
@@ -49,7 +52,10 @@ def unit_meshes(sides: int = 24) -> tuple[Mesh, Mesh]:
 
 @cache
 def football_meshes(radius: float, subdivisions: int = 3) -> tuple[Mesh, Mesh]:
-    """The 20 hexagons and the 12 pentagons of a football, a truncated icosahedron blown up. radius [m]."""
+    """Return meshes of the 20 hexagons and the 12 pentagons of a football. radius [m].
+
+    It is a truncated icosahedron, its faces subdivided and projected on the sphere.
+    """
     golden = 0.5 * (1.0 + 5.0**0.5)
     tips = [np.roll((0.0, y, z), turn) for y in (-1.0, 1.0) for z in (-golden, golden) for turn in range(3)]
     hexagons, pentagons = [], []
@@ -76,9 +82,9 @@ def football_meshes(radius: float, subdivisions: int = 3) -> tuple[Mesh, Mesh]:
 
 
 class Capsules:
-    """Links as capsules, two balls and a tube each: all balls are one node of Viser's tree, all tubes another.
+    """Capsules of links, two balls and a tube each: all balls are one node of Viser's tree, all tubes another.
 
-    With nodes of their own they would be dozens of messages a picture, whose time is taken from whoever plans.
+    With a node per link, each frame would take dozens of messages, and their time would be taken from the planner.
     """
 
     def __init__(
@@ -89,7 +95,10 @@ class Capsules:
         colours: Sequence[Colour],
         opacity: float | None,
     ) -> None:
-        """name: in Viser's tree. colours: of each link. opacity: in (0, 1), or None."""
+        """Add the capsules to the scene.
+
+        name: in Viser's tree. colours: of each link. opacity: in (0, 1), or None.
+        """
         radii = np.array([link.radius for link in links])
         self._to_end = np.array([0.5 * link.length * np.array(link.axis) for link in links])
         self._along = Rotation.concatenate([Rotation.align_vectors(link.axis, (0.0, 0.0, 1.0))[0] for link in links])
@@ -114,7 +123,7 @@ class Capsules:
         self._known = np.ones(len(links), bool)
 
     def move(self, state: np.ndarray) -> None:
-        """To a state (n, 13); those that are not known (NaN) shrink to nothing."""
+        """Move the links to a state (n, 13); those whose state is not known (NaN) shrink to nothing."""
         known = np.isfinite(state).all(axis=1)
         state = np.where(known[:, None], state, np.arange(SIZE) == ORIENTATION.start)
         place, turned = state[:, POSITION], Rotation.from_quat(state[:, ORIENTATION], scalar_first=True)
@@ -129,7 +138,7 @@ class Capsules:
 
 
 class SceneView:
-    """All links of a scene, drawn under one name."""
+    """Drawing of all links of a scene under one name."""
 
     def __init__(
         self,
@@ -139,7 +148,10 @@ class SceneView:
         colour: Colour | None = None,
         opacity: float | None = None,
     ) -> None:
-        """name: in Viser's tree. colour: one for all links, not their own. opacity: in (0, 1), or None."""
+        """Add the links to the scene.
+
+        name: in Viser's tree. colour: of all links, instead of their own ones. opacity: in (0, 1), or None.
+        """
         self._server, self._links = server, len(scene.links)
         self._root = server.scene.add_frame(name, show_axes=False)
         self._balls = {}

@@ -1,4 +1,4 @@
-"""The server behind the page: who may enter, what a client may change, and how it begins and ends."""
+"""Server behind the page: its start and end, the requests it admits, and the values that clients may change."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from websockets.http11 import Request, Response
 from larp_model.errors import InputError
 from viewer.checked import alike
 
-RESOLVING = 1.5  # s until a host's name must be known
-PATIENCE = 0.5  # s in which a client may answer that the server closes
-LARGEST_MESSAGE = 2**20  # bytes; from a client, whose messages here are of a few hundred
+RESOLVING = 1.5  # s until a host's name must be resolved
+PATIENCE = 0.5  # s for clients to acknowledge that the server closes
+LARGEST_MESSAGE = 2**20  # bytes of a client's message; usual ones have a few hundred
 
-# What a client of Viser may ask for, and no page of ours offers.
+# Messages that Viser accepts from clients, for features that no page of this viewer offers.
 REFUSED = (
     messages.ShareUrlRequest,
     messages.ShareUrlDisconnect,
@@ -40,7 +40,7 @@ REFUSED = (
     messages.FileTransferPart,
 )
 
-# What stands for the fields that name or place something in a client's message, whatever its kind.
+# Example values of the fields that name or place something in a client's message of any kind; see `is_sound`.
 FIELDS: dict[str, Any] = {
     **dict.fromkeys(("name", "uuid", "owner"), ""),
     **dict.fromkeys(("position", "look_at", "up_direction"), (0.0, 0.0, 0.0)),
@@ -55,18 +55,18 @@ _NAME = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)*")
 
 
 def require_address(host: str, port: int, allowed: Sequence[str] = ()) -> None:
-    """Refuse what `open_server` would refuse, without opening anything for longer than a moment."""
+    """Raise InputError if `open_server` would; the address is opened for a moment only."""
     _checked_names(allowed)
     _listening(host, port).close()
 
 
 def open_server(host: str = "127.0.0.1", port: int = 8080, allowed: Sequence[str] = ()) -> viser.ViserServer:
-    """A silent Viser server on exactly this address; port 0 takes a free one.
+    """Return a silent Viser server on exactly this address; port 0 takes a free one.
 
     It answers only requests for this address that come from its own page or from no page at all. allowed: other names,
-    without ports, by which a proxy before it is reached, and whose pages may ask. A host that others can reach is
-    warned of on stderr. Raises InputError where the address cannot be had: Viser itself would move to another port, or
-    try for ever.
+    without ports, by which a proxy in front of it is reached, and whose pages may send requests. For a host that other
+    machines can reach, a warning is printed on stderr. Raises InputError if the address cannot be opened: Viser itself
+    would move to another port, or try for ever.
     """
     proxies = _checked_names(allowed)
     listening = _listening(host, port)
@@ -83,34 +83,37 @@ def open_server(host: str = "127.0.0.1", port: int = 8080, allowed: Sequence[str
 
 
 def close_server(server: viser.ViserServer) -> None:
-    """Stop a server, silently and within seconds, whatever its clients do."""
+    """Stop a server, without output and within seconds, whatever its clients do."""
     with redirect_stdout(io.StringIO()):
         server.stop()
 
 
 def address_of(server: viser.ViserServer) -> str:
-    """What to type into a browser on this machine."""
+    """Return the URL of the page for a browser on this machine."""
     return f"http://{_bracketed(server.get_host())}:{server.get_port()}"
 
 
 def is_loopback(address: str) -> bool:
-    """Whether only this machine reaches the numeric address."""
+    """Return whether only this machine can reach the numeric address."""
     return ip_address(address).is_loopback
 
 
 def names_of(host: str, local: bool) -> frozenset[str]:
-    """Hosts by which a browser may ask for a server bound to this one, without ports: forwarding changes these."""
+    """Return the host names, without ports, by which a browser may address a server bound to `host`.
+
+    Ports are left out, for forwarding changes them.
+    """
     here = ("127.0.0.1", "[::1]") if local else (socket.gethostname(),)
     return frozenset(name.lower() for name in ("localhost", _bracketed(host), *here))
 
 
 def admits(headers: Headers, names: frozenset[str], addresses: bool, proxies: frozenset[str] = frozenset()) -> bool:
-    """Whether a request is for one of these names and, where a page sent it, from the page of this very server.
+    """Return whether a request is for one of these names and, if a page sent it, comes from this server's own page.
 
-    addresses: whether any IP address will do as a name. proxies: names that a request may be for as well, and whose
-    pages may send it, for a proxy may put our address into the request and leave its own in the page's. To reach us,
-    the page of another site must be served under a name that its owner first has resolve to itself and then to us; it
-    is that name which gives it away.
+    addresses: whether any IP address is accepted as a name. proxies: names that a request may be for as well, and whose
+    pages may send it, for a proxy may put this server's address into the Host header and leave its own in the Origin
+    header. To reach this server, the page of another site must be served under a name that its owner resolves first to
+    that site and then to this server; that name is not among the accepted ones.
     """
     hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
     asked = _HOST.fullmatch(hosts[0].lower()) if len(hosts) == 1 else None
@@ -123,9 +126,10 @@ def admits(headers: Headers, names: frozenset[str], addresses: bool, proxies: fr
 
 
 def is_sound(raw: str | bytes) -> bool:
-    """Whether a client's message has names that are text and places that are finite vectors of their length.
+    """Return whether names in a client's message are text and its places are finite vectors of the right length.
 
-    Viser would put them into its state as they are. What it cannot read at all passes here: it then drops the sender.
+    Viser would put them into its state unchecked. A message that Viser cannot decode at all passes here: Viser then
+    drops the sender.
     """
     try:
         message = msgspec.msgpack.decode(raw) if isinstance(raw, bytes) else None
@@ -138,19 +142,23 @@ def is_sound(raw: str | bytes) -> bool:
 
 class _Connection(ServerConnection):
     async def recv(self, decode: bool | None = None) -> Any:
-        """The next message that is sound; others are dropped."""
+        """Return the next message that passes `is_sound`; others are dropped."""
         while not is_sound(raw := await super().recv(decode)):
             pass
         return raw
 
 
 class _Server(viser.ViserServer):
-    """Viser has no hook for whom to serve, so for its start it meets another `serve` in the place of websockets'."""
+    """Viser server that refuses foreign requests.
+
+    Viser has no hook for this, so during its start `serve` of websockets is replaced by one that adds the checks.
+    """
 
     def __init__(self, host: str, listening: socket.socket, local: bool, proxies: frozenset[str]) -> None:
-        """listening: bound to the host, which is local if only this machine reaches it. Closed by `stop`.
+        """Start the server on a socket.
 
-        proxies: see `admits`.
+        listening: socket that is bound to the host; `stop` closes it. local: whether only this machine reaches the
+        host. proxies: see `admits`.
         """
         names = names_of(host, local)
         self._served: listener.serve | None = None
@@ -182,7 +190,7 @@ class _Server(viser.ViserServer):
         self._websock_server.register_handler(messages.GuiUpdateMessage, self._change)
 
     def stop(self) -> None:
-        """Close all connections and end all threads; clients that do not answer are cut off."""
+        """Close all connections and end all threads; clients that do not respond are cut off."""
         if self._served is not None:
             loop = self._served.server.loop
             with suppress(RuntimeError):  # it is closed already
@@ -190,10 +198,10 @@ class _Server(viser.ViserServer):
         super().stop()
 
     def request_share_url(self, verbose: bool = True) -> None:
-        """There is no public address."""
+        """Do nothing: there is no public address to request."""
 
     def disconnect_share_url(self) -> None:
-        """There is no public address."""
+        """Do nothing: there is no public address to give up."""
 
     def _cut_off(self) -> None:
         assert self._served is not None
@@ -201,7 +209,10 @@ class _Server(viser.ViserServer):
             connection.transport.abort()
 
     async def _change(self, client: Any, message: messages.GuiUpdateMessage) -> None:
-        """A client may change the value of a control. Viser would let it set any attribute of it, to anything."""
+        """Apply a client's change of a control's value; drop any other.
+
+        Viser would let a client set any attribute of a control, to anything.
+        """
         control = self.gui._gui_input_handle_from_uuid.get(message.uuid)
         if control is None or not isinstance(message.updates, dict) or [*message.updates] != ["value"]:
             return
@@ -223,7 +234,7 @@ def _guard(answer: Answer, names: frozenset[str], addresses: bool, proxies: froz
 
 
 def _checked_names(allowed: Sequence[str]) -> frozenset[str]:
-    """Hosts' names in lower case; refuses what is none, a port or an address of a page say."""
+    """Return host names in lower case; raise InputError for anything else, such as one with a port, or a URL."""
     for name in allowed:
         if not _NAME.fullmatch(name.lower()):
             raise InputError(f"allow_host has {name!r}, but needs hosts' names without port, such as hub.example.org")
@@ -231,7 +242,7 @@ def _checked_names(allowed: Sequence[str]) -> frozenset[str]:
 
 
 def _listening(host: str, port: int) -> socket.socket:
-    """A socket that listens there, so that nobody can take the port between the question and the answer."""
+    """Return a socket that already listens at the address, so that nobody can take its port between check and use."""
     if not isinstance(port, int) or not 0 <= port < 2**16:
         raise InputError(f"port is {port!r}, but must be an integer in [0, 65536)")
     try:
@@ -244,7 +255,7 @@ def _listening(host: str, port: int) -> socket.socket:
 
 
 def _resolved(host: str, port: int) -> tuple[socket.AddressFamily, Any]:
-    """Family and address, IPv4 where there is one. Raises OSError, also where the answer takes too long."""
+    """Return family and address of a host, IPv4 if there is one. Raises OSError, also if resolving takes too long."""
     found: list[Any] = []
 
     def look() -> None:

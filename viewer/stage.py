@@ -1,4 +1,4 @@
-"""What stands around a scene: pitch, light and goal; and lanes, in each of which a kick is drawn."""
+"""Surroundings of a scene: pitch, light and goal; and lanes, in each of which a kick is drawn."""
 
 from __future__ import annotations
 
@@ -16,18 +16,21 @@ LEGEND = "orange: truth, blue: prediction, green: target"
 GROUND, LINES, POSTS = (233, 238, 234), (190, 202, 194), (250, 250, 250)
 GOAL = (6.0, 3.0, 2.0)  # m: how far ahead it stands, how wide and how high it is; for scale alone
 FIELD_OF_VIEW = 0.7  # rad, from top to bottom
-FAR = 6  # m, up to which the ground is numbered
-# Candidates' paths are drawn from cheap to dear in these shares of the colour map.
+FAR = 6  # m, up to which the ground has distance labels
+# Colour map of candidates' paths, and the parts of it for the cheapest and the most expensive one.
 FAN, CHEAP, DEAR = "viridis_r", 0.05, 0.95
 
 
 class Lane:
-    """One kick: what happened, and as ghosts what the model and the reference say; both paths, target and miss."""
+    """Drawing of one kick: ground truth, prediction and reference as ghosts, both paths, target and miss."""
 
     def __init__(
         self, server: viser.ViserServer, scene: Scene, name: str, target: np.ndarray, traced: int, aside: float = 0.0
     ) -> None:
-        """name: in Viser's tree. target: (3,) [m]. traced: row of the link whose path is drawn. aside: along y [m]."""
+        """Add the lane to the scene.
+
+        name: in Viser's tree. target: (3,) [m]. traced: row of the link whose path is drawn. aside: offset along y [m].
+        """
         self._server, self._name, self._traced = server, name, traced
         self._radius = scene.links[traced].radius
         self._root = server.scene.add_frame(name, show_axes=False, position=(0.0, aside, 0.0))
@@ -47,13 +50,13 @@ class Lane:
         self.aim(target)
 
     def aim(self, target: np.ndarray) -> None:
-        """Move the target (3,) [m]."""
+        """Move the target to (3,) [m]."""
         self.target = np.asarray(target, float)
         self._ball.position = self.target
         self._label.position = self.target + np.array([0.0, 0.0, self._radius])
 
     def show(self, state: np.ndarray, **ghosts: np.ndarray | None) -> None:
-        """Move the truth to a state (L, 13) and each ghost to its own, or hide it; the reference kicks no ball."""
+        """Move the ground truth to a state (L, 13) and each ghost to its own, or hide it; the reference has no ball."""
         if (reference := ghosts.get("reference")) is not None:
             ghosts["reference"] = alone = np.array(reference)
             alone[self._traced] = np.nan
@@ -63,12 +66,12 @@ class Lane:
                 ghost.update(ghosts.get(name) if name in self.shown else None)
 
     def trace(self, path: np.ndarray | None, expected: np.ndarray | None = None, new: bool = True) -> float:
-        """Draw the paths (T, 3) of the truth and (T', 3) of the prediction [m]; None: there is none.
+        """Draw the paths (T, 3) of the ground truth and (T', 3) of the prediction [m]; None: there is none.
 
-        new: whether the prediction is; else it has been drawn.
+        new: whether the prediction is new; otherwise it has already been drawn.
 
-        Returns how near the true one comes to the target [m], or, as long as it still comes nearer, the expected one; a
-        label at the target says it in cm.
+        Returns the least distance [m] of the true path from the target or, as long as that path still comes nearer, of
+        the predicted one; inf without a path. A label at the target shows it in cm.
         """
         with self._server.atomic():
             self._line("truth", path, TRUTH, 0.025)
@@ -80,14 +83,14 @@ class Lane:
                 self._label.visible = False
                 return float("inf")
             if len(found) > 1 and np.linalg.norm(found[""].point - ways[""][-1]) < self._radius:
-                del found[""]  # it is still on its way
+                del found[""]  # the true path still approaches the target
             kind, approach = next(iter(found.items()))
             self._line("miss", np.stack([approach.point, self.target]), TARGET, 0.012)
             self._label.text, self._label.visible = f"{100.0 * approach.distance:.1f} cm{kind}", True
         return approach.distance
 
     def fan(self, paths: np.ndarray | None, costs: np.ndarray | None = None) -> None:
-        """Draw candidates' paths (N, T, 3) [m], coloured by their costs (N,); without those that are not finite."""
+        """Draw candidates' paths (N, T, 3) [m], coloured by the rank of their costs (N,), if these are finite."""
         place = f"{self._name}/path/fan"
         if paths is None or costs is None or not (sound := np.isfinite(costs)).any():
             self._server.scene.remove_by_name(place)
@@ -100,11 +103,11 @@ class Lane:
         self._server.scene.add_line_segments(place, segments.astype(np.float32), repeated, thickness=0.006)
 
     def position(self, state: np.ndarray) -> np.ndarray:
-        """(*, 3) [m] of the traced link in states (*, L, 13)."""
+        """Return positions (*, 3) [m] of the traced link in states (*, L, 13)."""
         return np.asarray(state)[..., self._traced, POSITION]
 
     def remove(self) -> None:
-        """Take all of it from the stage."""
+        """Remove the lane from the scene."""
         self._root.remove()
 
     def _line(self, name: str, points: np.ndarray | None, colour: Colour, thickness: float) -> None:
@@ -117,15 +120,18 @@ class Lane:
         if line is None:
             place = f"{self._name}/path/{name}"
             self._lines[name] = self._server.scene.add_line_segments(place, segments, colour, thickness=thickness)
-        else:  # a line that is there takes new points at a fraction of what another takes
+        else:  # updating a line takes a fraction of the time of adding one
             line.points, line.visible = segments, True
 
 
 class Stage:
-    """The pitch, and on it one kick, or two side by side."""
+    """Pitch with one kick on it, or two side by side."""
 
     def __init__(self, server: viser.ViserServer, scene: Scene, target: np.ndarray, traced: int = -1) -> None:
-        """target: (3,) [m]. traced: row in the state of the link whose path is drawn."""
+        """Draw the pitch and the scene.
+
+        target: (3,) [m]. traced: row in the state of the link whose path is drawn.
+        """
         self._server, self.scene, self._traced = server, scene, traced
         with server.atomic():
             server.scene.reset()
@@ -134,7 +140,7 @@ class Stage:
         self.beside: Lane | None = None
 
     def compare(self, target: np.ndarray | None, aside: float = -2.5) -> Lane | None:
-        """A second lane, so far along y [m] from the first, for another kick; None takes it away."""
+        """Add and return a second lane for another kick, `aside` along y [m]; with no target, remove the old one."""
         if self.beside is not None:
             self.beside.remove()
             self.beside = None
@@ -144,31 +150,34 @@ class Stage:
         return self.beside
 
     def frame(self, points: np.ndarray) -> None:
-        """Have all of (P, 3) [m] in the picture of whoever opens the page, or asks for the view as at first."""
+        """Set the points (P, 3) [m] that cameras must see, and the camera of newly opened pages and of a reset view."""
         self._seen = around(points)
         camera = self.camera("side", 1.6)
         first = self._server.initial_camera
         first.fov, first.position, first.look_at = FIELD_OF_VIEW, camera.place, self.middle(camera)
 
     def camera(self, view: View, aspect: float) -> PictureCamera:
-        """The camera that has in its picture, of width over height `aspect`, what `frame` said."""
+        """Return the camera that sees all points set by `frame`. aspect: width over height of its picture."""
         return PictureCamera.of(self._seen, 1.0 / aspect, view, float(np.tan(0.5 * FIELD_OF_VIEW)) * aspect)
 
     def middle(self, camera: PictureCamera) -> np.ndarray:
-        """The point (3,) [m] amid all that is seen on which a camera turns."""
+        """Return the point (3,) [m] that a camera orbits: on its axis, at the mean depth of the points of `frame`."""
         depth = float(camera.depth(self._seen).mean())
         return np.asarray(camera.place + depth * camera.axes[2])
 
 
 def whole(recording: Recording) -> np.ndarray:
-    """Points (P, 3) [m] of a recording that must be seen: the human up to the strike, the ball up to its target."""
+    """Return the points (P, 3) [m] of a recording that a camera must see.
+
+    They are the links of the first state, the path of the ball up to its target, and the target.
+    """
     approach = nearest_approach(recording.path, recording.target)
     target = np.asarray(recording.target, float)
     return np.concatenate([recording.states[0, :, POSITION], recording.path[: approach.row + 2], target[None]])
 
 
 def ground(server: viser.ViserServer) -> None:
-    """The ground with a grid of metres, up and the light."""
+    """Add the ground with a metre grid, the upward direction and the light."""
     server.scene.set_up_direction("+z")
     server.scene.configure_environment_map("studio", environment_intensity=0.6)
     server.scene.add_grid(
@@ -188,7 +197,7 @@ def ground(server: viser.ViserServer) -> None:
 
 
 def _pitch(server: viser.ViserServer) -> None:
-    """The ground with a grid of metres and their numbers, and a goal."""
+    """Add the ground with a metre grid and distance labels, and a goal."""
     ground(server)
     for metre in range(1, FAR + 1):
         server.scene.add_label(

@@ -1,4 +1,4 @@
-"""What a task offers on its page, and what people ask for there."""
+"""Settings that a task offers on its page, and those that its users choose."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 Box = tuple[tuple[float, ...], tuple[float, ...]]
-"""The lowest and the highest corner [m], or [m/s]."""
+"""Lowest and highest corner of a box [m] or [m/s]."""
 
 
 class Wishes(NamedTuple):
-    """What the next kick should be, as it is set on the page.
+    """Settings of the next kick, as chosen on the page.
 
-    target: (3,) [m]. spot: (2,), where the ball lies [m], from its usual place. roll: (2,), how fast it rolls [m/s].
-    preset, dynamics, weights, reference: names out of those offered. budget: seconds that a plan may take; 0: as long
-    as the preset takes. terms: weight of each named cost.
+    target: (3,) [m]. spot: (2,), offset of the ball from its usual position [m]. roll: (2,), its rolling velocity
+    [m/s]. preset, dynamics, weights, reference: names from those offered. budget: seconds that a plan may take; 0: as
+    long as the preset takes. terms: weight of each named cost.
     """
 
     target: tuple[float, ...]
@@ -31,9 +31,9 @@ class Wishes(NamedTuple):
 
 @dataclass(frozen=True)
 class Offer:
-    """What may be asked for: names, the usual one first; weights of the costs as they are; boxes that bound the rest.
+    """Settings that users may choose: names, the default first; initial cost weights; boxes that bound the rest.
 
-    push: the strongest push, a change of velocity [m/s]. longest: the largest budget [s].
+    push: largest component of a push, a change of velocity [m/s]. longest: largest budget [s].
     """
 
     presets: tuple[str, ...]
@@ -49,7 +49,7 @@ class Offer:
 
 
 class Push(NamedTuple):
-    """A body is hit: its velocity changes by this much (3,) [m/s] at once."""
+    """Instant change (3,) [m/s] of a body's velocity."""
 
     body: str
     change: tuple[float, ...]

@@ -1,0 +1,1 @@
+"""Motion from 2D keypoints: detector files, cameras, kinematic start, physical fit and metrics."""

@@ -1,9 +1,9 @@
-"""AIST++: people who dance before nine cameras, from its annotations (CC BY 4.0), in our frame.
+"""Reader of AIST++, dancers recorded by nine cameras, from its annotations (CC BY 4.0), in our frame.
 
-Of the folder that is distributed, keypoints2d/, keypoints3d/, cameras/ and ignore_list.txt are read. Points are what a
-detector found in each camera's images, and what these nine together say of where the joints are. Lengths are in
-centimetres and y points up, both as well as the cameras were calibrated, which was from the dancers alone; where the
-ground is nobody measured: here it is so far below the ankles that they are as high as ours are when we stand.
+Of the distributed folder, keypoints2d/, keypoints3d/, cameras/ and ignore_list.txt are read. They hold keypoints that a
+detector gave for each camera's images, and joint positions estimated from all nine together. Lengths are in centimetres
+and y points up, both as accurately as the cameras were calibrated, from the dancers alone. The ground's height was not
+measured: here it is set so that the ankles are as high above it as our figure's when it stands.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from tasks.keypoints.points import POINTS, Keypoints
 
 # Frames a second, of all films; how many cameras there are.
 RATE, CAMERAS = 60.0, 9
-# How high ankles are where feet stand [m], as our figure's; and how many of the lowest are taken for errors [%].
+# Height of our figure's ankles where its feet stand [m]; share of the lowest ankles that are taken for errors [%].
 ANKLE, ASTRAY = 0.067, 5.0
 # Cameras that AIST++ leaves out itself: one that is not in time with the others, one with smaller images.
 UNUSABLE = {"gBR_sBM_cAll_d04_mBR0_ch01": 4, "gJB_sBM_cAll_d07_mJB3_ch05": 6}
-# Of a camera: size and matrix [px], turn from the world as a rotation vector, shift [cm], and what bends its rays.
+# Fields of a camera: size and matrix [px], rotation vector from the world, translation [cm], distortion coefficients.
 FIELDS = {"size": (2,), "matrix": (3, 3), "rotation": (3,), "translation": (3,), "distortions": (5,)}
-# From its world, y up, to ours.
+# Rotation from its world, y up, to ours.
 TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _COUNT = len(ORDERS[17])
 _KNOWN = [row for row, name in enumerate(POINTS) if name in ORDERS[17]]
@@ -40,7 +40,7 @@ _ANKLES = [POINTS.index("left_ankle"), POINTS.index("right_ankle")]
 
 
 class Dance(NamedTuple):
-    """A film: what a detector found, its camera, and where `POINTS` truly are (T, P, 3) [m], NaN where not known.
+    """Film with its keypoints, its camera, and the true `POINTS` (T, P, 3) [m], NaN where not known.
 
     Heels and toes are never known.
     """
@@ -51,7 +51,7 @@ class Dance(NamedTuple):
 
 
 def sequences(folder: Path) -> dict[str, str]:
-    """The setting of the cameras by the name of each sequence, those left out that AIST++ itself found faulty."""
+    """Return the camera setting of each sequence, by name, without the sequences that AIST++ lists as faulty."""
     mapping, ignored = folder / "cameras" / "mapping.txt", folder / "ignore_list.txt"
     if not folder.is_dir():
         raise InputError(f"aist is {str(folder)!r}, but must be the folder of AIST++'s annotations")
@@ -64,20 +64,21 @@ def sequences(folder: Path) -> dict[str, str]:
 
 
 def seen_by(name: str) -> tuple[str, int | None]:
-    """The sequence of a video, and which camera made it, from 0; a sequence's own name, with cAll, is of no camera."""
+    """Return the sequence of a video and its camera, from 0; None for a sequence's own name, with cAll."""
     found = re.search(rf"_c0([1-{CAMERAS}])_", name)
     return (name.replace(found[0], "_cAll_", 1), int(found[1]) - 1) if found else (name, None)
 
 
 def video(sequence: str, camera: int) -> str:
-    """The name of what one camera, from 0, made of a sequence."""
+    """Return the name of the video of a sequence by one camera, from 0."""
     return sequence.replace("_cAll_", f"_c{camera + 1:02}_")
 
 
 def load(folder: Path, sequence: str, camera: int) -> Dance:
-    """Return the `Dance` of one camera, from 0, of a sequence; InputError says what is missing or damaged.
+    """Return the `Dance` of one camera, from 0, of a sequence; an InputError names what is missing or damaged.
 
-    Distortion is taken out of the keypoints, so that the camera has none; so is a focal length that differs across.
+    Keypoints are corrected for lens distortion and for a focal length that differs between x and y, so that the camera
+    has neither.
     """
     settings = sequences(folder)
     if sequence not in settings:
@@ -120,9 +121,9 @@ def load(folder: Path, sequence: str, camera: int) -> Dance:
 
 
 def undistorted(places: np.ndarray, distortion: np.ndarray) -> np.ndarray:
-    """Places (*, 2) one length ahead of the camera, its distortion (k1, k2, p1, p2, k3 of OpenCV) taken out.
+    """Return normalised image places (*, 2) with the distortion (k1, k2, p1, p2, k3 of OpenCV) removed.
 
-    By fixed-point iteration, which the little that these lenses distort lets converge.
+    Uses fixed-point iteration, which converges for the small distortion of these lenses.
     """
     k1, k2, p1, p2, k3 = distortion
     found = places
@@ -138,7 +139,7 @@ def undistorted(places: np.ndarray, distortion: np.ndarray) -> np.ndarray:
 
 
 def _camera(path: Path, which: int) -> dict[str, np.ndarray]:
-    """The numbers of `FIELDS` of one of the cameras of a setting."""
+    """Return the arrays of `FIELDS` of one camera, from 0, of a setting's file."""
     require_file("aist", path)
     try:
         cameras = json.loads(path.read_bytes())

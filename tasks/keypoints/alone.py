@@ -1,11 +1,11 @@
-"""Frames of a film solved alone, and which sequence of what they lead to is taken.
+"""Fits to single frames of a film, and the choice of one solution per frame that moves least.
 
-    minimise over x_t     sum_i c_it |project(p_i(x_t, b)) - y_it|^2 / (3 sigma)^2      points lie where they were seen
+    minimise over x_t     sum_i c_it |project(p_i(x_t, b)) - y_it|^2 / (3 sigma)^2      points lie on the keypoints
                         + |hinge(angles)|^2 + |S^(-1/2) (angles - m)|^2                poses are as people's are
                         + sum_feet |min(0, h_f)|^2                                     nobody is in the ground
 
-from many headings and poses in every frame; one image leaves open who leans forwards and who backwards, so of what they
-lead to the sequence that moves least is taken (R. Bellman's dynamic programming).
+from many headings and poses in every frame. One image does not show whether a limb points towards the camera or away
+from it, so of the solutions of all frames, the sequence that moves least is taken (R. Bellman's dynamic programming).
 """
 
 from __future__ import annotations
@@ -25,31 +25,31 @@ from tasks.keypoints.likely import POSES, usual_poses, within
 from tasks.keypoints.points import FEET, POINTS, Keypoints
 from tasks.keypoints.rows import by_rows, single
 
-# Frames a second and headings from which frames are solved alone, and steps for each.
+# Frames per second that are solved alone, initial headings of each, and steps of the solver.
 SPARSE, HEADINGS, ALONE = 12.0, 12, 12
-# How fast the body may seem to move between them [m/s], and what that counts beside how well it fits.
+# Speed [m/s] at which motion between them costs one unit, and the weight of that cost beside the fit.
 PACE, MOVED = 0.9, 5.0
-# Of depth in the ground [m], as a standard deviation.
+# Standard deviation of depth in the ground [m].
 SUNK = 0.08
-# Tilts [rad] from which the least costly is taken, the height [m] that a person is above the ground there, and frames
-# tried.
+# Camera tilts [rad] that are tried, the standard deviation [m] of a person's height above the ground in them, and the
+# number of frames that are solved for each.
 TILTS, AFLOAT, FEW = (-0.1, 0.0, 0.1, 0.2, 0.3, 0.45), 0.1, 6
 
 
 class Alone:
-    """The equations of single frames."""
+    """Least-squares problems of the single frames of one film."""
 
     def __init__(self, keypoints: Keypoints, camera: Camera, sigma: float) -> None:
-        """sigma: standard deviation of the keypoints [px]."""
+        """Set up the problems; sigma: standard deviation of the keypoints [px]."""
         self.keypoints, self.camera, self.sigma, self.figure = keypoints, camera, sigma, figure()
         self.starts = usual_poses()[2]
 
     def solved(
         self, frames: np.ndarray, turns: np.ndarray, begin: np.ndarray, free: np.ndarray, shared: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What single frames (F,) lead to from turns (F, S, 3, 3) and changes (F, S, D) on, those free (D,) to change.
+        """Solve single frames (F,) from S starts each: turns (F, S, 3, 3) and changes (F, S, D).
 
-        Returns turns, changes and costs (F, S).
+        free: (D,) 1 for the degrees of freedom that may change, else 0. Returns turns, changes and costs (F, S).
         """
         known = single((self.camera, self.sigma, shared, free))
         seen = (np.nan_to_num(each[frames]) for each in (self.keypoints.places, self.keypoints.confidence))
@@ -61,7 +61,10 @@ class Alone:
         return turned @ turns, changes, costs
 
     def begun(self, frames: np.ndarray, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Turns (F, S, 3, 3) and changes (F, S, D): every heading and usual pose, as far away as the image is small."""
+        """Return starts of frames (F,): turns (F, S, 3, 3) and changes (F, S, D), of every heading and usual pose.
+
+        The distance from the camera follows from the size of the person in the image.
+        """
         camera = seen_by(self.camera, shared)
         headings = np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False)
         turns = np.repeat(Rotation.from_rotvec(headings[:, None] * (0.0, 0.0, 1.0)).as_matrix(), POSES, axis=0)
@@ -81,7 +84,7 @@ class Alone:
         return np.broadcast_to(turns, (len(frames), *turns.shape)), begin
 
     def sequence(self, frames: np.ndarray, points: np.ndarray, costs: np.ndarray) -> np.ndarray:
-        """Which of S possibilities to take in each of the frames (F,), by points (F, S, P, 3) and costs (F, S)."""
+        """Return the index of the chosen solution of each frame (F,), by points (F, S, P, 3) [m] and costs (F, S)."""
         best, steps = costs[0], []
         for row in range(1, len(frames)):
             far = PACE * (frames[row] - frames[row - 1]) / self.keypoints.rate
@@ -96,13 +99,13 @@ class Alone:
 
     @cached_property
     def frames(self) -> np.ndarray:
-        """The frames that are solved alone."""
+        """Return the indices of the frames that are solved alone."""
         every = max(1, round(self.keypoints.rate / SPARSE))
         enough = np.flatnonzero((self.keypoints.confidence > 0.3).sum(axis=1) >= 6)
         return np.unique(np.append(enough[::every], enough[-1]))
 
     def points(self, turns: np.ndarray, changes: np.ndarray, shared: np.ndarray) -> np.ndarray:
-        """Points (F, S, P, 3) [m] of turns (F, S, 3, 3) and changes (F, S, D)."""
+        """Return the points (F, S, P, 3) [m] of turns (F, S, 3, 3) and changes (F, S, D)."""
         flat = Pose(
             changes[..., :3].reshape(-1, 3),
             turns.reshape(-1, 3, 3),
@@ -111,18 +114,21 @@ class Alone:
         return self.figure.all_points(flat, shared[:SHARED]).reshape(*changes.shape[:2], len(POINTS), 3)
 
     def chosen(self, turns: np.ndarray, begin: np.ndarray, free: np.ndarray, shared: np.ndarray) -> Pose:
-        """A pose in all frames: of what `frames` lead to when solved alone, the sequence that moves least."""
+        """Return a pose in all frames: of the solutions of single `frames`, the sequence that moves least."""
         turns, changes, costs = self.solved(self.frames, turns, begin, free, shared)
         points = self.points(turns, changes, shared)
         rows = np.arange(len(self.frames)), self.sequence(self.frames, points, costs)
         return _between(self.frames, changes[rows], turns[rows], len(self.keypoints))
 
     def first(self, shared: np.ndarray) -> Pose:
-        """A pose in all frames, from nothing."""
+        """Return a pose in all frames, without an initial guess."""
         return self.chosen(*self.begun(self.frames, shared), self.free, shared)
 
     def tilted(self, usual: np.ndarray) -> np.ndarray:
-        """What is usually shared, but for the tilt at which some frames, solved alone, show a person on the ground."""
+        """Return shared values: the usual ones, with the camera's tilt estimated.
+
+        Of `TILTS`, it is the one at which some frames, solved alone, fit best and show a person on the ground.
+        """
         frames, found = self.frames[:: max(1, len(self.frames) // FEW)], []
         for tilt in TILTS:
             shared = usual.copy()
@@ -134,11 +140,14 @@ class Alone:
 
     @property
     def free(self) -> np.ndarray:
-        """Every degree of freedom of a frame (D,)."""
+        """Return ones (D,): every degree of freedom of a frame may change."""
         return np.ones(6 + 3 * self.figure.joints)
 
     def rethought(self, pose: Pose, shared: np.ndarray, limb: tuple[int, ...]) -> Pose:
-        """The pose, the joints of one limb in another way where a sequence of such ways fits better."""
+        """Return the pose with the joints of one limb solved again from its own and the usual poses' angles.
+
+        limb: rows of its joints. Of all solutions of single frames, the sequence that moves least is taken.
+        """
         ways = np.concatenate(
             [
                 pose.angles[self.frames][:, None, list(limb)],
@@ -161,7 +170,7 @@ class Alone:
 
 
 def _between(frames: np.ndarray, changes: np.ndarray, turns: np.ndarray, count: int) -> Pose:
-    """The pose in all of so many frames, from some of them."""
+    """Return the pose in all `count` frames, interpolated between those in `frames`."""
     at = np.clip(np.arange(count), frames[0], frames[-1])
     mix = lambda values: np.stack([np.interp(at, frames, each) for each in values.T], axis=1)  # noqa: E731
     turn = Rotation.from_matrix(turns)
@@ -172,7 +181,7 @@ def _between(frames: np.ndarray, changes: np.ndarray, turns: np.ndarray, count: 
 def _residuals(
     body: Figure, camera: Camera, sigma: Array, shared: Array, turn: Array, places: Array, weights: Array, change: Array
 ) -> Array:
-    """Of one frame that shows places (P, 2) [px] of weights (P,); see `image.moved`."""
+    """Return the residuals of one frame with places (P, 2) [px] of weights (P,); see `image.moved`."""
     points, found = moved(body, camera, turn, change, shared)
     image = jnp.sqrt(weights)[:, None] * (found - places) / (3.0 * sigma)
     sunk = jnp.minimum(points[jnp.array(FEET), 2], 0.0) / SUNK
@@ -183,7 +192,7 @@ def _improved(
     body: Figure, camera: Camera, sigma: Array, shared: Array, free: Array,
     turn: Array, places: Array, weights: Array, change: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """A change (D,) and its cost after some steps of Levenberg and Marquardt's, those free (D,) to change."""
+    """Return a change (D,) and its cost after `ALONE` Levenberg-Marquardt steps; free: (D,) 1 where it may change."""
     residuals = partial(_residuals, body, camera, sigma, shared, turn, places, weights)
 
     def step(carry: tuple[Array, Array, Array], _: None) -> tuple[tuple[Array, Array, Array], None]:

@@ -1,8 +1,8 @@
-"""Pickled arrays, read without running anything that the file names.
+"""Reader of pickled arrays that runs nothing that the file names.
 
-A pickle is a program that calls what it names. Here its steps are followed by hand, and only those are known that make
-numbers, text, bytes, tuples, lists, dicts, and NumPy's arrays of numbers or text. Not even `NAMES` are looked up: each
-stands for what is done here.
+A pickle is a program that calls the functions that it names. Here its opcodes are interpreted, and only those are
+accepted that make numbers, text, bytes, tuples, lists, dicts, and NumPy's arrays of numbers or text. Not even `NAMES`
+are imported: each stands for an operation of this module.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from larp_model.errors import InputError
 
 _CORES = ("numpy.core", "numpy._core")
-# Of what a file may name, each by its name here.
+# Functions that a file may name, with the name of the operation here.
 NAMES = {
     "numpy ndarray": "array",
     "numpy dtype": "type",
@@ -38,11 +38,11 @@ _CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": (
 
 
 class _Name(str):
-    """A value of `NAMES`, told from text in the file by its type."""
+    """Value of `NAMES`, distinguished from text in the file by its type."""
 
 
 class _Unfinished:
-    """An array, or a type of arrays, of which the rest is still to come."""
+    """Array, or type of arrays, whose state a later opcode of the file gives."""
 
     def __init__(self, kind: np.dtype | None = None) -> None:
         self.kind = kind

@@ -1,4 +1,4 @@
-"""The equations of least squares in time: a band of blocks, with an edge of unknowns that all frames share."""
+"""Normal equations of least squares over time: a block-banded matrix bordered by unknowns that all frames share."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from threadpoolctl import threadpool_limits
 
 
 class Banded:
-    """Normal equations: blocks (D, D), zero beyond two off the diagonal, an edge of S columns and their corner."""
+    """Normal equations: blocks (D, D) up to two off the diagonal, an edge of S columns, and their corner (S, S)."""
 
     def __init__(self, frames: int, size: int, shared: int) -> None:
         self.blocks = np.zeros((3, frames, size, size))  # of rows f + offset, columns f
@@ -17,7 +17,10 @@ class Banded:
         self.slope = np.zeros((frames, size)), np.zeros(shared)
 
     def add(self, weights: np.ndarray, residual: np.ndarray, slopes: tuple[tuple[int, np.ndarray], ...]) -> None:
-        """Residuals (F, K) of weights (F, K), by derivatives (F, K, D + S) along frames f + offset, offsets rising."""
+        """Add residuals (F, K) of weights (F, K).
+
+        slopes: (offset, derivatives (F, K, D + S)) by frames f + offset and the shared unknowns, offsets rising.
+        """
         split, length = self.edge.shape[1], len(residual)
         for number, (offset, one) in enumerate(slopes):
             weighed = (weights[..., None] * one).swapaxes(1, 2)
@@ -35,12 +38,12 @@ class Banded:
                     self.corner += common.T
 
     def share(self, weights: np.ndarray, values: np.ndarray) -> None:
-        """What is shared, its values (S,), as residuals of weights (S, S)."""
+        """Add a prior on the shared unknowns: their values (S,) as residuals, with weights (S, S)."""
         self.corner += weights
         self.slope[1][:] += weights @ values
 
     def solved(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
-        """The step (F, D), (S,) down the slope, its matrix's diagonal larger by a share."""
+        """Return the step of frames (F, D) and shared unknowns (S,); damping: share added to the matrix's diagonal."""
         _, frames, size, _ = self.blocks.shape
         band = np.zeros((3 * size, frames * size))
         row, column = np.indices((size, size))

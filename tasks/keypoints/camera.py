@@ -1,4 +1,4 @@
-"""A pinhole camera that stands still."""
+"""Stationary pinhole camera, and its JSON file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 from larp_model.errors import InputError
 from larp_model.names import require_file, require_known
 
-# Horizontal field of view of a phone's camera that nobody has described [degrees], and the height it is held at [m].
+# Horizontal field of view of a phone's camera [degrees] and its height [m], where they are not given.
 FIELD_OF_VIEW, HELD = 65.0, 1.4
 FIELDS = ("size", "field_of_view", "focal", "centre", "position", "look_at")
 
@@ -22,7 +22,7 @@ FIELDS = ("size", "field_of_view", "focal", "centre", "position", "look_at")
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera without distortion.
+    """Pinhole camera without distortion.
 
     focal: length [px]. centre: of the image (2,) [px]. turn: rotation matrix (3, 3) from the world, z up, to the
     camera's axes: to the right, down, ahead. position: (3,) [m], in the world.
@@ -34,19 +34,22 @@ class Camera:
     position: Any
 
     def project(self, points: Any) -> Any:
-        """Places (*, 2) [px] of points (*, 3) [m], arrays of NumPy or JAX; those beside or behind it are far off."""
+        """Return places (*, 2) [px] of points (*, 3) [m], arrays of NumPy or JAX.
+
+        Points beside or behind the camera are projected far outside the image.
+        """
         xp = points.__array_namespace__()
         local = (points - self.position) @ self.turn.T
         return self.focal * local[..., :2] / xp.maximum(local[..., 2:], 0.05) + self.centre
 
     def ray(self, places: np.ndarray) -> np.ndarray:
-        """Directions (*, 3), in the world, one metre ahead of the camera each, of places (*, 2) [px]."""
+        """Return rays (*, 3) of places (*, 2) [px], in the world frame, each reaching one metre ahead of the camera."""
         ahead = np.ones((*places.shape[:-1], 1))
         return np.concatenate([(places - self.centre) / self.focal, ahead], axis=-1) @ self.turn
 
 
 def looking(position: np.ndarray, at: np.ndarray, focal: float, size: tuple[float, float]) -> Camera:
-    """The camera at a position (3,) that looks at a point (3,) [m], upright; size: of its images [px]."""
+    """Return an upright camera at a position (3,) that looks at a point (3,) [m]; size: of its images [px]."""
     ahead = np.asarray(at, float) - position
     ahead /= np.linalg.norm(ahead)
     right = np.cross(ahead, (0.0, 0.0, 1.0))
@@ -59,24 +62,24 @@ def looking(position: np.ndarray, at: np.ndarray, focal: float, size: tuple[floa
 
 
 def focal_length(field_of_view: float, width: float) -> float:
-    """In pixels, of a camera with a horizontal field of view [degrees] and images so wide [px]."""
+    """Return the focal length [px] of a horizontal field of view [degrees] and an image width [px]."""
     if not 10.0 <= field_of_view <= 150.0:
         raise InputError(f"field_of_view is {field_of_view:g}, but must be from 10 to 150 degrees")
     return 0.5 * width / math.tan(math.radians(0.5 * field_of_view))
 
 
 def held(focal: float, size: tuple[float, float]) -> Camera:
-    """A level camera held before one's face, which looks along x."""
+    """Return a level camera at the usual height `HELD`, which looks along x."""
     position = np.array([0.0, 0.0, HELD])
     return looking(position, position + np.array([1.0, 0.0, 0.0]), focal, size)
 
 
 def load(path: str | Path, size: tuple[float, float] | None = None) -> tuple[Camera, bool]:
-    """The camera of a JSON file, and whether the file says where it stands.
+    """Return the camera of a JSON file, and whether the file gives its position.
 
     {"size": [width, height] in px, "field_of_view": degrees or "focal": px, "centre": [x, y] in px, "position": [x, y,
-    z] and "look_at": [x, y, z] in m}: size may be left out where the keypoints tell it, the centre where it is the
-    image's, position and look_at where they are to be estimated.
+    z] and "look_at": [x, y, z] in m}: size may be left out where the keypoints have it (argument `size`), the centre
+    where it is the image's, position and look_at where they are to be estimated.
     """
     path = Path(path)
     require_file("camera", path)

@@ -1,4 +1,4 @@
-"""The figure that is laid over an image: our human's joints in a pose, its size and proportions free."""
+"""Figure that is fitted to an image: our human's joints in a pose, with free size and proportions."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from larp_model.scene import Body, Vector
 from tasks.keypoints.points import FEET, POINTS, SIDES
 from tasks.keypoints.rows import by_rows, single
 
-# What of a body may differ from the usual: a link's length, or the radius by which the shoulders are apart.
+# Sizes that may differ from the usual: links' lengths (0), and the torso's radius (1), which sets the shoulder width.
 PROPORTIONS = (
     ("pelvis", 0), ("torso", 0), ("torso", 1), ("head", 0),
     ("upper_arm", 0), ("lower_arm", 0), ("thigh", 0), ("shin", 0), ("foot", 0),
 )  # fmt: skip
-# Points that are joints, by the link that each carries.
+# Points that are joints, and the link that each carries.
 JOINTS = {"shoulder": "upper_arm", "elbow": "lower_arm", "hip": "thigh", "knee": "shin", "ankle": "foot"}
-# Where the others are on their links, as joints' anchors are: along the axis in half-lengths, across it in radii. A
-# wrist is where forearms end (0.146 of a height, D. Winter).
+# Places of the other points on their links, given as joints' anchors are: along the axis in half-lengths, across it in
+# radii. A wrist is at the end of the forearm (0.146 of the height, D. Winter).
 ON_LIMBS: dict[str, tuple[str, Vector]] = {
     "wrist": ("lower_arm", (0.0, 0.0, -0.7)),
     "heel": ("foot", (-1.3, 0.0, -0.6)),
@@ -34,12 +34,12 @@ ON_HEAD: dict[str, Vector] = {"nose": (1.0, 0.0, 0.0), "left_ear": (0.0, 0.8, 0.
 SHARED = 1 + len(PROPORTIONS) + 1
 # Height of the usual human [m].
 USUAL = 1.75
-# How high heel and toe are where the foot stands [m].
+# Height of heel and toe where the foot stands [m].
 SOLE = 0.017
 
 
 class Pose(NamedTuple):
-    """Of the figure in T frames: pelvis (T, 3) [m], its turn (T, 3, 3), joint angles (T, J, 3) [rad]."""
+    """Pose of the figure in T frames: pelvis (T, 3) [m], its rotation (T, 3, 3), joint angles (T, J, 3) [rad]."""
 
     place: np.ndarray
     turn: np.ndarray
@@ -47,10 +47,11 @@ class Pose(NamedTuple):
 
 
 class Figure:
-    """A human whose points follow from its pose and proportions.
+    """Human whose points follow from its pose and proportions.
 
-    Proportions (11,) are logarithms: of the whole, as a share of the usual human, and of each of `PROPORTIONS` beside
-    that. The last is by how much the shoulders are seen ahead of the trunk, in lengths of the torso.
+    Proportions (11,) are logarithms of ratios: first the size relative to the usual human, then each of `PROPORTIONS`
+    relative to that size. The last one is no logarithm: the shift of the shoulder points ahead of the trunk, in lengths
+    of the torso.
     """
 
     def __init__(self) -> None:
@@ -74,12 +75,12 @@ class Figure:
         self._share = share
 
     def scaled(self, proportions: Array) -> Array:
-        """Lengths and radii (n, 2) [m] of the links."""
+        """Return lengths and radii (n, 2) [m] of the links."""
         grown = proportions[0] + jnp.einsum("p,pnk->nk", proportions[1:-1], jnp.asarray(self._share))
         return jnp.asarray(self.sizes[:, :2]) * jnp.exp(grown)
 
     def of(self, proportions: np.ndarray) -> Body:
-        """The human of these proportions, as heavy as its volume says."""
+        """Return the human of these proportions; its mass scales with the cube of the overall size."""
         sizes = np.array(self.sizes)
         sizes[:, :2] = np.asarray(self.scaled(jnp.asarray(proportions)), float)
         sizes[:, 2] *= np.exp(3.0 * float(proportions[0]))
@@ -87,7 +88,7 @@ class Figure:
 
     @partial(jax.jit, static_argnums=0)
     def height(self, proportions: Array) -> Array:
-        """Of who stands upright [m], in proportion to how high the nose is above the heels."""
+        """Return the standing height [m], in proportion to the nose's height above the heels."""
 
         def reach(proportions: Array) -> Array:
             points = self.points(jnp.zeros(3), jnp.eye(3), jnp.zeros((self.joints, 3)), proportions)
@@ -96,7 +97,7 @@ class Figure:
         return USUAL * reach(proportions) / reach(jnp.zeros(SHARED))
 
     def points(self, place: Array, turn: Array, angles: Array, proportions: Array) -> Array:
-        """Points (P, 3) [m] of one pose: pelvis (3,) [m], its turn (3, 3), joint angles (J, 3) [rad]."""
+        """Return points (P, 3) [m] of one pose: pelvis (3,) [m], its rotation (3, 3), joint angles (J, 3) [rad]."""
         sizes = self.scaled(proportions)
         turned = matrix(from_rotation_vector(angles))
         places, turns = [place], [turn]
@@ -115,14 +116,14 @@ class Figure:
         return jnp.stack([found[name] + ahead if "shoulder" in name else found[name] for name in POINTS])
 
     def all_points(self, pose: Pose, proportions: np.ndarray) -> np.ndarray:
-        """Points (T, P, 3) [m] of all frames."""
+        """Return the points (T, P, 3) [m] of all frames."""
         common = single(proportions)
         return by_rows(lambda *given: _all_points(self, *given, common), *pose)
 
 
 @cache
 def figure() -> Figure:
-    """The one that films are seen by."""
+    """Return the figure that all films share, made once."""
     return Figure()
 
 

@@ -1,4 +1,4 @@
-"""Motions as a detector would see them: a camera, noise, points that are missed or taken for the other side's."""
+"""Synthetic keypoints of motions: a camera, noise, and points that are missed or swapped between the sides."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tasks.keypoints.metrics import pelvis
 from tasks.keypoints.points import POINTS, SIDES, Keypoints
 from tasks.motions.skeleton import Motion
 
-# What a skeleton calls the joints at which our points are.
+# A skeleton's names of the joints at which our points are.
 JOINTS = {
     "shoulder": "Arm", "elbow": "ForeArm", "wrist": "Hand", "hip": "UpLeg", "knee": "Leg", "ankle": "Foot",
 }  # fmt: skip
@@ -27,7 +27,7 @@ SIZE = (1000.0, 1000.0)
 
 
 class Noise(NamedTuple):
-    """Of a detector: how far its points are off [px], shares that are missed, or taken for the other side's."""
+    """Noise of a detector: standard deviation of its points [px], and shares that are missed, or swapped in side."""
 
     pixels: float = 4.0
     missed: float = 0.03
@@ -38,7 +38,7 @@ USUAL = Noise()
 
 
 def points_of(motion: Motion) -> np.ndarray:
-    """Where `POINTS` are in a captured motion (T, P, 3) [m]; what its skeleton lacks rides on the nearest joint."""
+    """Return `POINTS` (T, P, 3) [m] of a captured motion; those that its skeleton lacks move with the nearest joint."""
     found, hips = [], motion.hip_height
     for name in POINTS:
         side, _, limb = name.partition("_")
@@ -52,7 +52,7 @@ def points_of(motion: Motion) -> np.ndarray:
 
 
 def camera_around(random: np.random.Generator, points: np.ndarray) -> Camera:
-    """A camera somewhere around points (T, P, 3) [m], from the knees' to above head height, which sees all of them."""
+    """Return a random camera around points (T, P, 3) [m], at knee to above head height, far enough to see them all."""
     middle = 0.5 * (points.min(axis=(0, 1)) + points.max(axis=(0, 1)))
     angle, field_of_view = random.uniform(-np.pi, np.pi), random.uniform(40.0, 75.0)
     height, focal = random.uniform(0.6, 2.2), focal_length(field_of_view, SIZE[0])
@@ -69,9 +69,9 @@ def camera_around(random: np.random.Generator, points: np.ndarray) -> Camera:
 def seen(
     random: np.random.Generator, camera: Camera, points: np.ndarray, rate: float, noise: Noise = USUAL
 ) -> Keypoints:
-    """The keypoints that a detector would give of points (T, P, 3) [m] in a film of so many frames a second.
+    """Return the keypoints of a simulated detector for points (T, P, 3) [m]; rate: frames per second.
 
-    Errors are those of single frames in part, in part they last for some. Confidence falls with the error.
+    Errors are partly independent between frames, partly correlated over some. Confidence falls with the error.
     """
     frames, count = points.shape[:2]
     slow = np.array(
@@ -94,7 +94,7 @@ def seen(
 
 
 def panned(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Points (T, P, 3) [m] that the camera sees as it would the given ones if it turned after the pelvis."""
+    """Return points (T, P, 3) [m] whose image is that of the given ones by a camera that pans after the pelvis."""
     turns = [looking(camera.position, each[0], camera.focal, SIZE).turn for each in pelvis(points)]
     return camera.position + np.einsum("ji,tjk,tpk->tpi", camera.turn, turns, points - camera.position)
 

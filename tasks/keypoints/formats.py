@@ -1,8 +1,8 @@
-"""Files in which detectors of people leave what they found in the images of a film, read strictly.
+"""Strict readers of the files in which pose detectors store keypoints of a film.
 
 OpenPose writes a folder with one JSON file a frame, AlphaPose one list in the form of COCO's results, MMPose one list
 of frames for a film and one file for each of several images; MediaPipe's landmarks come as a list of frames; our own
-form is an npz file. What a file is shows in its content, not in its name.
+format is an npz file. The format is recognised by the file's content, not by its name.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _ARMS, _LEGS = _sides("right", "left", *_ARM), _sides("right", "left", *_LEG)
 _HEAD = ("right_eye", "left_eye", "right_ear", "left_ear")
 _COCO = ("nose", *_pairs("eye", "ear", *_ARM, *_LEG))
 _HALPE = (*_COCO, "head", "neck", "pelvis", *_pairs(*_FOOT))
-# What the points of a person are, by their number. Those of whole bodies, 133 and 136, go on with faces and hands.
+# Names of a person's points, by how many there are. Those of whole bodies, 133 and 136, go on with faces and hands.
 ORDERS = {
     17: _COCO,
     18: ("nose", "neck", *_ARMS, *_LEGS, *_HEAD),  # OpenPose's COCO
@@ -60,8 +60,10 @@ _LOST, _LEAP, _PACE = 0.5, 0.25, 3.0
 
 
 class Loaded(NamedTuple):
-    """The points of one person, how many people there are, and the number of frames in which another's box and this
-    one's share more than half of the smaller of them: there the two may have been mixed up.
+    """Keypoints of one person, with the number of people in the file.
+
+    crossed: number of frames in which another person's bounding box and this one's share more than half of the smaller
+    of them: there the two may have been mixed up.
     """
 
     keypoints: Keypoints
@@ -70,14 +72,14 @@ class Loaded(NamedTuple):
 
 
 class _Detection(NamedTuple):
-    """A person in a frame: places [px] and confidence of `POINTS` (P, 3), and who it is, where the file says so."""
+    """Person in a frame: places [px] and confidence of `POINTS` (P, 3), and a tracker's number if the file has one."""
 
     points: np.ndarray
     identity: float | None
 
 
 class _Film(NamedTuple):
-    """What a file holds: people in frames by their numbers; frames a second and size [px] where it knows them."""
+    """Content of a file: people by frame number; frames per second and size [px] where the file has them."""
 
     frames: Mapping[int, list[_Detection]]
     rate: float | None = None
@@ -90,14 +92,15 @@ _Track = dict[int, _Detection]  # one person's, by frame, in the order of the fr
 def load(
     path: str | Path, rate: float | None = None, size: tuple[float, float] | None = None, person: int | None = None
 ) -> Loaded:
-    """Read one person's points; InputError, in one line, says what is missing, damaged or not understood.
+    """Read one person's points; an InputError of one line names what is missing, damaged or not understood.
 
-    path: a file, or a folder with one for each frame. rate: frames a second. size: width and height of the images [px].
-    Only npz files hold these two, and the arguments win. person: which one, from 0 in order of appearance; by default
-    the one who is seen the longest, largest and best. The frame with the lowest number in the file comes first.
+    path: a file, or a folder with one for each frame. rate: frames per second. size: width and height of the images
+    [px]. Only npz files store these two, and the arguments take precedence. person: index from 0 in order of
+    appearance; by default the one with the greatest sum of confidence times height in the image. The frame with the
+    lowest number in the file comes first.
 
-    An npz file has names (P,) out of `POINTS`, and places (T, P, 2), NaN where not found, perhaps with confidence
-    (T, P), or points (T, P, 3) that hold both; perhaps also rate and size (2,).
+    An npz file has names (P,) out of `POINTS`, and places (T, P, 2), NaN where not detected, optionally with confidence
+    (T, P), or points (T, P, 3) that contain both; optionally also rate and size (2,).
     """
     path = Path(path)
     name = path.absolute().name
@@ -137,7 +140,7 @@ def _read(path: Path, size: tuple[float, float] | None) -> _Film:
 
 
 def _in_order(frames: Mapping[int, list[_Detection]]) -> list[list[_Detection]]:
-    """All frames from the first number to the last, missing ones empty; people of whom nothing was found left out."""
+    """Return all frames from the first number to the last, missing ones empty, without people who have no points."""
     if not frames:
         raise InputError("has no frames")
     first, last = min(frames), max(frames)
@@ -166,7 +169,7 @@ def _folder(path: Path) -> dict[int, list[_Detection]]:
 
 
 def _numbered(labels: Iterable[object]) -> dict[int, object]:
-    """The frames' labels, their images' names or files', by the last number in each, its ending left out."""
+    """Return the frames' labels (names of images or files) by the last number in each, extensions ignored."""
     numbered: dict[int, object] = {}
     for label in labels:
         numbers = re.findall(r"\d+", Path(str(label)).stem)
@@ -186,7 +189,7 @@ def _parsed(path: Path) -> object:
 
 
 def _frames(content: object, size: tuple[float, float] | None) -> dict[int, list[_Detection]]:
-    """The frames of a JSON file that holds all of them."""
+    """Return the frames of a JSON file that contains all of them."""
     match content:
         case {"instance_info": [*entries], **more}:
             return _of_mmpose(entries, _called(more.get("meta_info")))
@@ -220,7 +223,7 @@ def _of_mmpose(entries: list, names: tuple[str, ...] | None = None) -> dict[int,
 
 
 def _called(meta: object) -> tuple[str, ...] | None:
-    """What MMPose itself calls the points, in their order."""
+    """Return MMPose's own names of the points, in their order; None where the file has none."""
     match meta:
         case {"keypoint_id2name": {**table}}:
             order = [str(number) for number in range(len(table))]
@@ -231,7 +234,7 @@ def _called(meta: object) -> tuple[str, ...] | None:
 
 
 def _people(entries: object, names: tuple[str, ...] | None = None) -> list[_Detection]:
-    """The people of a frame of OpenPose, AlphaPose or MMPose."""
+    """Return the people of a frame of OpenPose, AlphaPose or MMPose."""
     found = []
     for entry in _list(entries):
         match entry:
@@ -324,7 +327,7 @@ def _numbers(what: str, value: object) -> np.ndarray:
 
 
 def _ours(rows: np.ndarray, names: tuple[str, ...] | None = None) -> np.ndarray:
-    """Places [px] and confidence of `POINTS` (P, 3), NaN and 0 where not found, from a detector's, by its names."""
+    """Return places [px] and confidence of `POINTS` (P, 3) from a detector's rows; NaN and 0 where not detected."""
     if len(rows) not in (ORDERS if names is None else {len(names)}):
         known = ", ".join(map(str, ORDERS)) if names is None else f"{len(names)}, as many as it names"
         raise InputError(f"has a person of {len(rows)} points, but needs {known}")
@@ -340,14 +343,14 @@ def _ours(rows: np.ndarray, names: tuple[str, ...] | None = None) -> np.ndarray:
 
 
 def _identity(value: object) -> float | None:
-    """The number that a tracker gave to a person; AlphaPose lists those of all detections that it merged."""
+    """Return a tracker's number of a person; AlphaPose lists those of all detections it merged, the first is taken."""
     while isinstance(value, list):
         value = value[0] if value else None
     return value if isinstance(value, int | float) and value >= 0 else None
 
 
 def _tracks(frames: list[list[_Detection]], rate: float) -> list[_Track]:
-    """The people, in order of appearance: as the file tells them apart, else as they are near from frame to frame."""
+    """Return the people in order of appearance: by the file's own numbers, else by distance from frame to frame."""
     identities = [[one.identity for one in frame if one.identity is not None] for frame in frames]
     # Without its tracker, AlphaPose gives everybody the same number.
     if not any(identities) or any(len(set(each)) < len(each) for each in identities):
@@ -367,7 +370,7 @@ def _followed(frames: list[list[_Detection]], rate: float) -> list[_Track]:
         seen = [float(np.linalg.norm(np.ptp(_box(one.points), axis=0))) for one in frame]
         ages = [number - next(reversed(track)) for track in tracks]
         recent = [which for which, age in enumerate(ages) if age - 1 <= _LOST * rate]
-        # As parts of what is possible: who was lost for long must not take the place of one who is still there.
+        # Relative to the reach: a person who was lost for long must not take the place of one who is still there.
         costs = np.ones((len(recent), len(frame)))
         for row, which in enumerate(recent):
             last, reach = tracks[which][number - ages[which]], _LEAP + _PACE * ages[which] / rate
@@ -387,7 +390,7 @@ def _followed(frames: list[list[_Detection]], rate: float) -> list[_Track]:
 
 
 def _distance(points: np.ndarray, others: np.ndarray) -> float:
-    """Mean distance [px], by confidence, of the points that both have; infinite without any."""
+    """Return the mean distance [px] of the points that both have, weighted by confidence; infinite without any."""
     weights = points[:, 2] * others[:, 2]
     both = weights > 0.0
     if not both.any():
@@ -396,7 +399,7 @@ def _distance(points: np.ndarray, others: np.ndarray) -> float:
 
 
 def _box(points: np.ndarray) -> np.ndarray:
-    """Upper left and lower right corner (2, 2) [px] around the points that were found."""
+    """Return the upper left and lower right corner (2, 2) [px] of the box around the detected points."""
     found = points[points[:, 2] > 0.0, :2]
     return np.array([found.min(axis=0), found.max(axis=0)])
 

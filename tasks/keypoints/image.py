@@ -1,7 +1,8 @@
-"""The image of a figure, by a camera of which tilt and height may be unknown.
+"""Projection of a figure into the image of a camera whose tilt and height may be unknown.
 
-What all frames share (S,): the figure's proportions (11,), the camera's pitch and roll [rad] and by how much it is
-higher, as a logarithm, and how high what a detector takes for heels and for toes is in a foot that stands [m].
+Values shared by all frames (S,): the figure's proportions (11,), the camera's pitch and roll [rad], the logarithm of
+its height relative to the given one, and the heights [m], above `figure.SOLE`, of a detector's heel and toe points in a
+foot that stands.
 """
 
 from __future__ import annotations
@@ -15,25 +16,29 @@ from tasks.keypoints.camera import Camera
 from tasks.keypoints.figure import SHARED, Figure
 
 COMMON = SHARED + 3 + 2
-# Standard deviations of what is not known of a camera: pitch and roll [rad], and its height, as a share.
+# Standard deviations of a camera's unknown pitch and roll [rad], and of its height, as a share.
 TILT, ROLL, HEIGHT = 0.3, 0.05, 0.3
 
 
 def tilted(camera: Camera, unknown: Array) -> Camera:
-    """The camera turned by pitch and roll [rad] and raised, (3,), see above."""
+    """Return the camera with pitch, roll [rad] and height changed by `unknown` (3,), see the module."""
     turn = matrix(from_rotation_vector(jnp.stack([unknown[0], jnp.zeros(()), unknown[1]])))
     position = jnp.asarray(camera.position) * jnp.stack([1.0, 1.0, jnp.exp(unknown[2])])
     return Camera(camera.focal, jnp.asarray(camera.centre), turn @ jnp.asarray(camera.turn), position)
 
 
 def seen_by(camera: Camera, shared: np.ndarray) -> Camera:
-    """The camera as what is shared says that it is turned and raised."""
+    """Return the camera with the pitch, roll and height of the shared values (S,)."""
     turned = tilted(camera, jnp.asarray(shared[SHARED : SHARED + 3]))
     return Camera(camera.focal, camera.centre, np.asarray(turned.turn, float), np.asarray(turned.position, float))
 
 
 def moved(body: Figure, camera: Camera, turn: Array, change: Array, shared: Array) -> tuple[Array, Array]:
-    """Points (P, 3) [m] and their places (P, 2) [px]; change: place, turn, angles; shared: proportions, camera."""
+    """Return points (P, 3) [m] and their places (P, 2) [px].
+
+    turn: rotation (3, 3) of the pelvis before the change. change: (D,) place [m], rotation vector [rad], joint angles
+    [rad]. shared: (S,), see the module.
+    """
     turned = matrix(from_rotation_vector(change[3:6])) @ turn
     points = body.points(change[:3], turned, change[6:].reshape(-1, 3), shared[:SHARED])
     return points, tilted(camera, shared[SHARED : SHARED + 3]).project(points)

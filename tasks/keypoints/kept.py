@@ -1,4 +1,4 @@
-"""What is kept of a reconstruction on its way, so that one that was cut off goes on where it was."""
+"""Checkpoint of an unfinished reconstruction, from which an interrupted one continues."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from tasks.keypoints.lift import Lifted
 
 
 class Spent(NamedTuple):
-    """What planning has taken: seconds, those of compiling apart, candidates, how many of them were lost.
+    """Effort of planning so far: seconds, seconds of compilation counted separately, and candidates.
 
-    verified: candidates that were tried in the truth, too.
+    lost: candidates whose rollout was not finite. verified: candidates that were also tried in the ground truth.
     """
 
     seconds: float = 0.0
@@ -31,7 +31,7 @@ class Spent(NamedTuple):
     verified: int = 0
 
     def and_by(self, info: PlanInfo) -> Spent:
-        """With another planning step."""
+        """Return the effort with that of another plan added."""
         lost = info.candidates - info.finite
         return Spent(
             self.seconds + info.seconds,
@@ -43,9 +43,10 @@ class Spent(NamedTuple):
 
 
 class Kept:
-    """What is known so far, in a file that is of use only to who does the same again.
+    """Checkpoint in a file, which only a reconstruction with the same inputs loads.
 
-    lifted: the kinematic start; begun: what was executed of the physical fit; each None while there is none.
+    lifted: the kinematic start; begun: the executed part of the physical fit; each None while there is none. spent:
+    the effort of planning so far.
     """
 
     lifted: Lifted | None = None
@@ -53,7 +54,7 @@ class Kept:
     spent: Spent = Spent()
 
     def __init__(self, path: Path, made_by: str) -> None:
-        """path: npz. made_by: see `fingerprint`; of what was done otherwise, or is damaged, nothing is taken."""
+        """Load the checkpoint; path: npz; made_by: see `fingerprint`. A file of another one, or damaged, is ignored."""
         self._path, self._made_by = path, made_by
         try:
             with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
@@ -63,7 +64,7 @@ class Kept:
             self.lifted, self.begun, self.spent = None, None, Spent()
 
     def keep(self, lifted: Lifted, begun: Begun | None = None, spent: Spent = Spent()) -> None:  # noqa: B008
-        """Write what is known."""
+        """Write the checkpoint."""
         camera = lifted.camera
         content: dict[str, Any] = {
             "made_by": self._made_by,
@@ -81,7 +82,7 @@ class Kept:
         write_whole(self._path, buffer.getvalue())
 
     def done(self) -> None:
-        """Nothing needs to be kept any more."""
+        """Delete the checkpoint, as the reconstruction is complete."""
         self._path.unlink(missing_ok=True)
 
     def _take(self, found: dict[str, np.ndarray]) -> None:
@@ -100,7 +101,7 @@ class Kept:
 
 
 def fingerprint(*parts: Any) -> str:
-    """Of arrays, bytes, texts and numbers: the same again only for the same."""
+    """Return a SHA-256 digest of arrays, bytes, texts and numbers, equal only for equal parts."""
     digest = hashlib.sha256()
     for part in parts:
         raw = np.asarray(part).tobytes()

@@ -1,19 +1,19 @@
-"""The kinematic start: a figure laid over the keypoints of a film, without any physics.
+"""Kinematic start: a figure fitted to the keypoints of a film, without any physics.
 
-    minimise over x_t = (place, turn, angles), proportions b and what is not known of the camera
+    minimise over x_t = (place, turn, angles), proportions b and the unknowns of the camera
 
         sum_t  sum_i c_it rho(|project(p_i(x_t, b)) - y_it| / sigma)      points lie where the detector saw them
-             + |hinge(angles)|^2 + |S^(-1/2) (angles - m)|^2              joints bend as joints do, and as people's do
-             + sum_i sqrt(1 + |p_i'' / s_i|^2)                            nothing jerks
-             + sum_feet a_ft |p_f'|^2 + a_ft h_f^2 + |min(0, h_f)|^2      feet that stand do so on the ground, and stay
-             + a_t |c - p - c'' z / g|^2                                  whom no foot holds up falls over
+             + |hinge(angles)|^2 + |S^(-1/2) (angles - m)|^2              joint angles are within limits, and usual
+             + sum_i sqrt(1 + |p_i'' / s_i|^2)                            accelerations are small
+             + sum_feet a_ft |p_f'|^2 + a_ft h_f^2 + |min(0, h_f)|^2      feet that stand are on the ground, and stay
+             + a_t |c - p - c'' z / g|^2                                  a body that no foot supports falls over
         + |(b - b_usual) / sigma_b|^2
 
-rho is Geman and McClure's, m and S are those of the project's own motions, a_ft says how much a foot looks as if it
-stood (both by iteratively reweighted least squares); c is the middle of the mass and p of the feet that stand.
+rho is Geman and McClure's, m and S are those of the project's own motions, a_ft says how likely a foot stands (both by
+iteratively reweighted least squares); c is the centre of mass and p the mean position of the feet that stand.
 
-From frames solved alone (`keypoints.alone`) on, all are solved together by Levenberg and Marquardt's steps, whose
-matrix is a band with an edge.
+Starting from frames solved alone (`keypoints.alone`), all frames are solved together by Levenberg-Marquardt steps,
+whose matrix is banded with a border (`keypoints.banded`).
 """
 
 from __future__ import annotations
@@ -36,28 +36,29 @@ from tasks.keypoints.likely import within
 from tasks.keypoints.points import FEET, POINTS, SIDES, Keypoints
 from tasks.keypoints.rows import by_rows, single
 
-# Standard deviations, in shares: of a detector's points, of the image's larger side; of the body's size.
+# Standard deviations: of a detector's points, as a share of the image's larger side; of the body's size, as a share.
 PIXELS, GROWN = 0.004, 0.06
-# Of single ones, `figure.PROPORTIONS` and shoulders: hips and trunks are seen where they are not, limbs are alike.
+# Standard deviations of `figure.PROPORTIONS` and of the shoulders' shift: detectors place hips and trunks with a bias,
+# limbs differ little.
 VARIED = (0.15, 0.15, 0.15, 0.15, 0.06, 0.12, 0.06, 0.06, 0.1, 0.15)
 LIMBS = ("upper_arm", "lower_arm"), ("thigh", "shin", "foot")
-# Of accelerations [m/s^2]: trunk and head, arms and legs.
+# Scales of accelerations [m/s^2]: trunk and head, arms and legs.
 TRUNK = 12.0
 QUICK = {"elbow": 40.0, "wrist": 40.0, "knee": 50.0, "ankle": 50.0, "heel": 50.0, "toe": 50.0}
-# Of what a standing foot moves [m/s], of its height and of its depth in the ground [m]; speeds [m/s] and heights [m] at
-# which one may stand.
+# Scales of a standing foot's speed [m/s], of its height and of its depth in the ground [m]; speed [m/s] and height [m]
+# at which a foot may stand.
 STILL, LEVEL, SUNK, SLOW, LOW = 0.10, 0.015, 0.005, 0.8, 0.08
-# Residuals beyond so many standard deviations count less and less.
+# Residuals beyond this number of standard deviations are weighted down.
 OUTLIER = 6.0
 STEPS = 40
-# Of the body's height, where it is known or a camera is not: then no image tells it, what is small jerks least, and
-# people are taken to be as tall as usual.
+# Standard deviation of the body's height, as a share, where the height is known or the camera is not. In the latter
+# case no image shows the scale and a small body accelerates least, so people are taken to be as tall as usual.
 UNSEEN = 0.005
-# Of where the weight is borne, beside the feet that stand [m]; the mass that is nearest to each point, as a share.
+# Standard deviation [m] of the centre of pressure around the feet that stand; mass nearest to each point, as a share.
 BORNE = 0.08
 MASSES = {"nose": 0.07, "shoulder": 0.16, "elbow": 0.035, "wrist": 0.02, "hip": 0.16, "knee": 0.06, "ankle": 0.03}
 GRAVITY = 9.81
-# Of how high what a detector takes for heel and toe is in a foot that stands [m].
+# Standard deviation of the height of a detector's heel and toe points in a foot that stands [m].
 SOLES = 0.02
 
 _SWAPS = (
@@ -67,10 +68,10 @@ _SWAPS = (
 
 
 class Lifted(NamedTuple):
-    """A figure in all frames.
+    """Figure fitted to all frames.
 
-    pose: see `figure.Pose`. proportions: (11,), see `Figure`. camera: as given, or as estimated. error: of the
-    points that were seen [px], the median.
+    pose: see `figure.Pose`. proportions: (11,), see `Figure`. camera: as given, or as estimated. error: median
+    reprojection error of the points that were seen [px].
     """
 
     pose: Pose
@@ -80,8 +81,9 @@ class Lifted(NamedTuple):
 
 
 class Now(NamedTuple):
-    """What follows from a pose: points (T, P, 3) [m], places (T, P, 2) [px], `likely.within` (T, K), and how high soles
-    are (T, 4) [m].
+    """Quantities that follow from a pose and the shared values.
+
+    points: (T, P, 3) [m]. places: (T, P, 2) [px]. unlike: `likely.within` (T, K). heights: of the soles (T, 4) [m].
     """
 
     points: np.ndarray
@@ -91,7 +93,7 @@ class Now(NamedTuple):
 
 
 class Term(NamedTuple):
-    """Residuals (F, K) of weights (F, K), and derivatives (F, K, D + S) by frames f + offset and what all share."""
+    """Residuals (F, K) with weights (F, K), and derivatives (F, K, D + S) by frames f + offset and shared values."""
 
     weights: np.ndarray
     residual: Callable[[Now], np.ndarray]
@@ -99,7 +101,7 @@ class Term(NamedTuple):
 
 
 class _Lifter:
-    """The equations of one film."""
+    """Least-squares problem of one film."""
 
     def __init__(self, keypoints: Keypoints, camera: Camera, known: bool, height: float | None) -> None:
         self.keypoints, self.camera, self.known, self.figure = keypoints, camera, known, figure()
@@ -110,14 +112,14 @@ class _Lifter:
             height = USUAL
         seconds, sigma = len(keypoints) / keypoints.rate, np.array([GROWN, *VARIED, *unknown, SOLES, SOLES])
         self.usual, self.prior = np.zeros(COMMON), seconds * np.diag(1.0 / sigma**2)
-        if height is not None:  # which all proportions together have
+        if height is not None:  # a prior on the height, which depends on all proportions
             along = np.zeros(COMMON)
             along[:SHARED] = jax.grad(self.figure.height)(jnp.zeros(SHARED)) / USUAL
             self.usual[0] = np.log(height / USUAL)
             self.prior += seconds * np.outer(along, along) / UNSEEN**2
 
     def solved(self) -> tuple[Pose, np.ndarray]:
-        """The pose and what is shared."""
+        """Return the pose and the shared values (S,)."""
         begin = self.usual if self.known else self.alone.tilted(self.usual)
         pose, shared = self.together(self.alone.first(begin), begin, STEPS // 2)
         names = [self.figure.body.links[child].name for child, _, _ in self.figure.body.motors]
@@ -127,7 +129,7 @@ class _Lifter:
         return self.together(pose, shared, STEPS)
 
     def together(self, pose: Pose, shared: np.ndarray, steps: int) -> tuple[Pose, np.ndarray]:
-        """The pose and what is shared, after so many steps at most."""
+        """Return the pose and the shared values (S,) after at most `steps` steps on all frames together."""
         places, confidence = self.keypoints.places, self.keypoints.confidence
         for again in range(3):
             damping = 1e-2
@@ -160,7 +162,7 @@ class _Lifter:
     def _unswapped(
         self, pose: Pose, shared: np.ndarray, places: np.ndarray, confidence: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Keypoints, left and right exchanged where they then fit better."""
+        """Return the places and confidence of keypoints, left and right exchanged where they then fit better."""
         found = self.now(pose, shared).places
         places, confidence = places.copy(), confidence.copy()
         for left, right in _SWAPS:
@@ -176,11 +178,11 @@ class _Lifter:
         return places, confidence
 
     def terms(self, pose: Pose, shared: np.ndarray, places: np.ndarray, confidence: np.ndarray) -> list[Term]:
-        """The residuals around a pose, their weights as they are there."""
+        """Return the residual terms around a pose, with weights and derivatives evaluated there."""
         frames, count, rate = len(pose.place), len(POINTS), self.keypoints.rate
         now = self.now(pose, shared)
         x, y, of_unlike = self.derivatives(pose, shared)
-        each = 30.0 / rate  # neighbouring frames of a fast film tell little that is new
+        each = 30.0 / rate  # neighbouring frames at a high frame rate add little information
         seen = (confidence > 0.0)[..., None]
 
         def image(now: Now) -> np.ndarray:
@@ -217,7 +219,10 @@ class _Lifter:
         ]  # fmt: skip
 
     def balance(self, now: Now, stands: np.ndarray, x: np.ndarray) -> Term:
-        """x'' = (x - p) g / z: whom no foot holds up falls over; p is where the weight is borne, among the feet."""
+        """Return the residuals of balance, x'' = (x - p) g / z: a body that no foot supports falls over.
+
+        x is the centre of mass at height z, p the centre of pressure, the mean of the feet weighted by `stands`.
+        """
         rate, mass = self.keypoints.rate, np.array([MASSES.get(name.rpartition("_")[2], 0.0) for name in POINTS])
         mass /= mass.sum()
         share = stands[1:-1] + 1e-9
@@ -248,17 +253,20 @@ class _Lifter:
         )
 
     def now(self, pose: Pose, shared: np.ndarray) -> Now:
-        """What follows from a pose and what is shared."""
+        """Return the quantities that follow from a pose and the shared values (S,)."""
         points, places, unlike = self.by_frames(_all_followed, pose, shared)
         return Now(points, places, unlike, points[:, FEET, 2] - SOLE - np.tile(shared[-2:], 2))
 
     def derivatives(self, pose: Pose, shared: np.ndarray) -> list[np.ndarray]:
-        """Of points (T, 3 P, D + S), places (T, 2 P, D + S) and `likely.within` (T, K, D + S), by pose and shared."""
+        """Return derivatives by pose and shared values.
+
+        They are those of points (T, 3 P, D + S), places (T, 2 P, D + S) and `likely.within` (T, K, D + S).
+        """
         found = self.by_frames(_all_slopes, pose, shared)
         return [each.reshape(len(each), -1, each.shape[-1]) for each in found]
 
     def by_frames(self, function: Callable[..., Any], pose: Pose, shared: np.ndarray) -> Any:
-        """`_followed` or `_slopes` of all frames."""
+        """Return the result of a compiled `_followed` or `_slopes` for all frames."""
         still = np.zeros_like(pose.place)
         change = np.concatenate([pose.place, still, pose.angles.reshape(len(pose.place), -1)], axis=1)
         camera, common = single((self.camera, shared))
@@ -266,42 +274,42 @@ class _Lifter:
 
 
 def _followed(body: Figure, camera: Camera, turn: Array, change: Array, shared: Array) -> tuple[Array, ...]:
-    """Points (P, 3) [m] of one frame, their places (P, 2) [px], and how unlike people's its pose is (K,)."""
+    """Return points (P, 3) [m] of one frame, their places (P, 2) [px], and the prior residuals (K,) of its pose."""
     return *moved(body, camera, turn, change, shared), within(body, turn, change)
 
 
 def _slopes(body: Figure, camera: Camera, turn: Array, change: Array, shared: Array) -> tuple[Array, ...]:
-    """Derivatives of `_followed`, along a change and what is shared (D + S,), on their last axis."""
+    """Return the derivatives of `_followed` by change and shared values (D + S,), on their last axis."""
     both = jax.jacfwd(_followed, (3, 4))(body, camera, turn, change, shared)
     return tuple(jnp.concatenate(each, axis=-1) for each in both)
 
 
-# Of many frames at once; cameras are arguments, or each would be compiled anew.
+# Compiled for many frames at once; cameras are arguments, or each would be compiled anew.
 _all_followed, _all_slopes = (
     jax.jit(jax.vmap(each, (None, None, 0, 0, None)), static_argnums=0) for each in (_followed, _slopes)
 )
 
 
 def noise(keypoints: Keypoints, camera: Camera) -> float:
-    """Standard deviation [px] of what a detector found."""
+    """Return the standard deviation [px] of detected keypoints."""
     return PIXELS * float(max(keypoints.size or 2.0 * np.asarray(camera.centre)))
 
 
 def second_differences(values: np.ndarray) -> np.ndarray:
-    """Second differences (T - 2, ...) along the frames."""
+    """Return the second differences (T - 2, ...) of values (T, ...) along the frames."""
     return values[2:] - 2.0 * values[1:-1] + values[:-2]
 
 
 def _after(pose: Pose, change: np.ndarray) -> Pose:
-    """The pose after a step (T, D) of place, turn and angles."""
+    """Return the pose after a step (T, D) of place, turn and angles."""
     turn = Rotation.from_rotvec(change[:, 3:6]).as_matrix() @ pose.turn
     return Pose(pose.place + change[:, :3], turn, pose.angles + change[:, 6:].reshape(pose.angles.shape))
 
 
 def lift(keypoints: Keypoints, camera: Camera, known: bool = True, height: float | None = None) -> Lifted:
-    """The figure in all frames, of which the first and the last show most of a person.
+    """Return the figure fitted to all frames, of which the first and the last must show most of a person.
 
-    known: whether it is known where the camera stands; else its tilt and height are estimated, from the given ones on.
+    known: whether the camera's position is known; else its tilt and height are estimated, starting from the given ones.
     height: of the person [m], where it is known; the usual one by default where the camera is not known.
     """
     lifter = _Lifter(keypoints, camera, known, height)

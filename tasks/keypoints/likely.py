@@ -1,4 +1,4 @@
-"""How a pose is unlike people's: beyond its joints' limits, unlike the project's own motions, leaning."""
+"""Prior on poses: joint limits, the distribution of the project's own motions, and an upright trunk."""
 
 from __future__ import annotations
 
@@ -12,17 +12,20 @@ from larp_model.rotation import from_rotation_vector, matrix
 from tasks.keypoints.figure import Figure, figure
 from tasks.motions import styles
 
-# Standard deviations: of angles beyond a joint's limits [rad]; of a trunk's lean [rad].
+# Standard deviations of angles beyond a joint's limits [rad], and of a trunk's lean [rad].
 BEYOND, LEAN = 0.05, 0.6
-# By how much more people's poses differ than those of the project's own motions [rad].
+# Standard deviation [rad] that is added to that of the project's own motions, as people's poses differ more.
 WIDER = 0.05
-# Unlike each other, from which frames are solved alone.
+# Number of initial poses, unlike each other, from which frames are solved alone.
 POSES = 4
 
 
 @cache
 def usual_poses() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean (J * 3,) and a square root (J * 3, J * 3) of the inverse covariance of angles, and some poses (M, J, 3)."""
+    """Return the mean and whitening matrix of joint angles, and some poses unlike each other.
+
+    Shapes: (J * 3,) [rad], (J * 3, J * 3), a square root of the inverse covariance, and (POSES, J, 3) [rad].
+    """
     random, body = np.random.default_rng(0), figure().body
     drawn = (
         styles.kicks(random, body, random.integers(0, 60, 160), 120, 0.01)[:, ::8],
@@ -43,7 +46,10 @@ def usual_poses() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def within(body: Figure, turn: Array, change: Array) -> Array:
-    """Of one pose (K,), its turn (3, 3) and change (D,): see `image.moved`."""
+    """Return the prior residuals (K,) of one pose, by its turn (3, 3) and change (D,), see `image.moved`.
+
+    They are angles beyond the limits, whitened angles and the lean, each in standard deviations.
+    """
     mean, whitening, _ = usual_poses()
     angles = change[6:]
     lower, upper = (jnp.asarray(each.ravel(), change.dtype) for each in (body.lower, body.upper))

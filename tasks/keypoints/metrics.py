@@ -1,7 +1,7 @@
-"""How far a reconstructed motion is from the true one, and how plausible it is: the paper's figures, and ours.
+"""Metrics of a reconstructed motion: errors against the true one, and plausibility; the paper's, and ours.
 
-True points that are not known are NaN. Means are over the others, and over frames whose pelvis is known where it is
-what a pose is aligned by.
+Unknown true points are NaN. Means are over the known ones and, for errors aligned by the pelvis, over frames in which
+the pelvis is known.
 """
 
 from __future__ import annotations
@@ -11,28 +11,28 @@ from scipy.spatial.transform import Rotation
 
 from tasks.keypoints.points import POINTS
 
-# Joints that are compared; hips are also what a pose is aligned by.
+# Joints that are compared; poses are aligned by the hips.
 JOINTS = [row for row, name in enumerate(POINTS) if name.partition("_")[2] not in ("heel", "toe", "ear")]
 HIPS = [POINTS.index("left_hip"), POINTS.index("right_hip")]
 FEET = {side: [POINTS.index(f"{side}_heel"), POINTS.index(f"{side}_toe")] for side in ("left", "right")}
-# A foot skates where it is in contact in two frames and moves farther in between [m].
+# A foot skates where it is in contact in two successive frames and moves farther than this in between [m].
 SKATE = 0.02
-# A foot is in contact where neither its heel nor its toe is higher above the ground [m].
+# A foot is in contact where both its heel and its toe are below this height above the ground [m].
 CONTACT = 0.05
-# Of how long a foot's speed is the mean [s].
+# Time over which a foot's speed is averaged [s].
 STRIDE = 0.1
 
 
 def pelvis(points: np.ndarray) -> np.ndarray:
-    """The middle between the hips (*, 1, 3) of points (*, P, 3)."""
+    """Return the midpoint of the hips (*, 1, 3) of points (*, P, 3)."""
     return points[..., HIPS, :].mean(axis=-2, keepdims=True)
 
 
 def position_errors(found: np.ndarray, true: np.ndarray) -> dict[str, float]:
-    """Mean joint errors [mm] of points (T, P, 3) [m]: `mpjpe_g_mm`, `mpjpe_mm` and `mpjpe_pa_mm`.
+    """Return mean joint errors [mm] of points (T, P, 3) [m]: `mpjpe_g_mm`, `mpjpe_mm` and `mpjpe_pa_mm`.
 
-    Aligned by the pelvis of the first frame in which it is known, by that of each frame, and by each frame's best turn,
-    shift and scale (Procrustes).
+    They are aligned by the pelvis of the first frame in which it is known, by the pelvis of each frame, and by each
+    frame's best rotation, translation and scale (Procrustes).
     """
 
     def mean(one: np.ndarray, other: np.ndarray) -> float:
@@ -48,9 +48,9 @@ def position_errors(found: np.ndarray, true: np.ndarray) -> dict[str, float]:
 
 
 def procrustes(found: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """Points (P, 3) turned, shifted and scaled so that their joints come as near to the true ones as they can.
+    """Return points (P, 3) rotated, translated and scaled so that their joints best fit the true ones.
 
-    NaN where fewer than three of these are known.
+    All are NaN where fewer than three of the true joints are known.
     """
     known = [row for row in JOINTS if np.isfinite(true[row]).all()]
     if len(known) < 3:
@@ -64,16 +64,16 @@ def procrustes(found: np.ndarray, true: np.ndarray) -> np.ndarray:
 
 
 def velocity_error(found: np.ndarray, true: np.ndarray, rate: float) -> float:
-    """Mean error [m/s] of the joints' velocities of points (T, P, 3) [m], aligned by the pelvis of each frame."""
+    """Return the mean error [m/s] of joint velocities of points (T, P, 3) [m], aligned by the pelvis of each frame."""
     both = ((each - pelvis(each))[:, JOINTS] for each in (found, true))
     one, other = (rate * np.diff(each, axis=0) for each in both)
     return float(np.nanmean(np.linalg.norm(one - other, axis=-1)))
 
 
 def foot_skate(points: np.ndarray) -> float:
-    """Share of frames [%] in which a foot in contact moves by more than 2 cm to the next; points (T, P, 3) [m].
+    """Return the share of frames [%] in which a foot in contact moves over 2 cm to the next; points (T, P, 3) [m].
 
-    NaN where heels or toes are not known.
+    It is NaN where heels or toes are not known.
     """
     if not all(np.isfinite(points[:, rows]).all() for rows in FEET.values()):
         return np.nan
@@ -86,9 +86,10 @@ def foot_skate(points: np.ndarray) -> float:
 
 
 def slip(points: np.ndarray, rate: float) -> float:
-    """Speed [m/s] of the heel or toe that is slowest, in three quarters of the frames at most; points (T, P, 3) [m].
+    """Return the 75th percentile over frames of the speed [m/s] of the slowest heel or toe; points (T, P, 3) [m].
 
-    Who is on foot has one that nearly stands most of the time, whatever the motion; unless the camera moves.
+    A person on foot has a heel or toe that nearly stands most of the time, whatever the motion; not so if the camera
+    moves.
     """
     feet = points[:, [row for rows in FEET.values() for row in rows]]
     frames = max(1, round(STRIDE * rate))
@@ -97,11 +98,14 @@ def slip(points: np.ndarray, rate: float) -> float:
 
 
 def pixel_error(places: np.ndarray, true: np.ndarray) -> float:
-    """Mean distance [px] of places (T, P, 2) of joints."""
+    """Return the mean distance [px] of the joints' places (T, P, 2) from the true ones."""
     return float(np.nanmean(np.linalg.norm(places[:, JOINTS] - true[:, JOINTS], axis=-1)))
 
 
 def off_the_ground(points: np.ndarray) -> dict[str, float]:
-    """How deep feet of points (T, P, 3) [m] are in the ground, and the share of frames [%] in which by over 2 cm."""
+    """Return the mean depth of feet in the ground [mm] and the share of frames [%] in which it is over 2 cm.
+
+    points: (T, P, 3) [m]. The keys are `sunk_mm` and `sunk`.
+    """
     lowest = points[:, [row for rows in FEET.values() for row in rows], 2].min(axis=1)
     return {"sunk_mm": 1e3 * float(np.maximum(-lowest, 0.0).mean()), "sunk": 100.0 * float((lowest < -0.02).mean())}

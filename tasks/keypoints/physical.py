@@ -1,4 +1,4 @@
-"""The physical fit: a servo-driven human whose image lies on the keypoints, executed in the truth.
+"""Physical fit: a servo-driven human whose projection lies on the keypoints, executed in the ground truth.
 
     minimise over theta   w_2 sum_i,t c_it |project(p_i(t)) - y_it|^2      points lie where the detector saw them
                         + w_x sum_i,t |x_i(t) - x_i^start(t)|^2           links stay near the kinematic start
@@ -8,8 +8,8 @@
                         + w_d |Q''|^2                                     and are smooth
     subject to            S_{t+1} = dynamics(S_t, Q_t),  Q = Q^start + spline(theta)
 
-in windows that overlap, each from the state that the truth has reached, warm-started by the last. The dynamics are LARP
-or MuJoCo; what comes out is what MuJoCo did.
+in overlapping windows, each from the state that the ground truth has reached, warm-started by the last. The dynamics
+are LARP or MuJoCo; the result is the motion in MuJoCo.
 """
 
 from __future__ import annotations
@@ -38,17 +38,16 @@ from tasks.keypoints.points import FEET, POINTS, Keypoints, interpolated
 from tasks.motions.references import clearance, leading, spinning
 from tasks.presets import PresetName
 
-# Spread of a first plan, as a share of how far the training data strays from its motions.
+# Spread of a first plan, as a share of the training data's spread around its motions.
 SEARCH = 0.5
-# What counts as one unit of each cost: distances [m] and velocities [m/s] off the kinematic
-# start's, a standing foot's speed [m/s].
+# Scales of the costs: distance [m] and velocity [m/s] from the kinematic start's, a standing foot's speed [m/s].
 NEAR, PACE, STILL = 0.05, 0.5, 0.3
 
 
 class FitPreset(NamedTuple):
-    """How much a fit may cost: steps that a plan looks ahead and its knots, how it is found, steps between plans.
+    """Budget of a fit: horizon of a plan [steps] and its knots, its optimiser, steps between plans.
 
-    verify: rounds of trials in the truth of each plan that a learned model finds, which correct it.
+    verify: rounds in which each plan of a learned model is tried in the ground truth and corrected.
     """
 
     horizon: int
@@ -58,13 +57,13 @@ class FitPreset(NamedTuple):
     verify: int = 0
 
     def optimizers(self, truth: Dynamics | None) -> tuple[Optimizer, ...]:
-        """Of a plan; truth: what a model's plans are tried in, if it is not the truth itself."""
+        """Return the optimisers of a plan; truth: the ground truth that tries a model's plans, None to try none."""
         if truth is None or not self.verify:
             return (self.steps,)
         return self.steps, Verified(truth, replace(self.steps, rounds=1), self.verify, candidates=1)
 
 
-# Who looks only half a second ahead sees too late that a start leans too far, and falls.
+# With a horizon of only half a second, a plan notices too late that a start leans too far, and the human falls.
 PRESETS: dict[PresetName, FitPreset] = {
     "fast": FitPreset(80, 11, GaussNewton(rounds=2, directions=48)),
     "balanced": FitPreset(80, 17, GaussNewton(rounds=4, directions=64)),
@@ -73,10 +72,10 @@ PRESETS: dict[PresetName, FitPreset] = {
 
 
 class WantedMotion(NamedTuple):
-    """What a film asks for at each of N steps.
+    """Motion that a film shows, at each of N steps.
 
     states (N, L, 13) and targets (N, J, 3) [rad] of the kinematic start; places (N, P, 2) [px] and weights (N, P) of
-    the keypoints; stands (N, 4), how much heels and toes look as if they stood.
+    the keypoints; stands (N, 4), from 0 to 1, how likely heels and toes stand.
     """
 
     states: np.ndarray
@@ -87,7 +86,7 @@ class WantedMotion(NamedTuple):
 
 
 def wanted_of(scene: Scene, figure: Figure, lifted: Lifted, keypoints: Keypoints) -> WantedMotion:
-    """The kinematic start and the keypoints at every step of the scene's time."""
+    """Return the kinematic start and the keypoints, resampled to the steps of the scene."""
     human = scene.bodies[0]
     begin, rate = keypoints.times, keypoints.rate
     times = np.arange(int(begin[-1] / scene.dt + 1e-6) + 1) * scene.dt
@@ -117,10 +116,10 @@ def wanted_of(scene: Scene, figure: Figure, lifted: Lifted, keypoints: Keypoints
 
 
 class Seen:
-    """Where the points of a film are on the human of a scene."""
+    """Points of a film on the human of a scene."""
 
     def __init__(self, human: Body, figure: Figure, proportions: np.ndarray) -> None:
-        """human: as it is simulated, which may be of other sizes than the figure of these proportions."""
+        """Place the points; human: as simulated, its sizes may differ from those of the figure of these proportions."""
         sizes = np.asarray(figure.scaled(jnp.asarray(proportions)), float)
         self.links, local = np.array([figure.anchors[name][0] for name in POINTS]), []
         for name in POINTS:
@@ -136,7 +135,7 @@ class Seen:
         self.ahead = proportions[-1] * sizes[figure.torso, 0] * np.array(["shoulder" in name for name in POINTS], float)
 
     def points(self, states: Any) -> Any:
-        """Points (*, P, 3) [m] of states (*, L, 13)."""
+        """Return the points (*, P, 3) [m] of states (*, L, 13)."""
         turned = matrix(packed.orientation(states))
         found = packed.position(states)[..., self.links, :]
         found = found + jnp.einsum(
@@ -146,7 +145,7 @@ class Seen:
 
 
 def terms_of(seen: Seen, camera: Camera, sigma: float, dt: float) -> tuple[CostTerm, ...]:
-    """The named costs of a candidate."""
+    """Return the named cost terms of a candidate."""
     feet = np.array(FEET)
 
     def image(states: Array, controls: Array, context: WantedMotion) -> Array:
@@ -185,7 +184,10 @@ def planner_of(
     scene: Scene, seen: Seen, camera: Camera, sigma: float, dynamics: Dynamics, preset: FitPreset,
     truth: Dynamics | None = None,
 ) -> Planner:  # fmt: skip
-    """A planner of these costs; sigma: standard deviation of the keypoints [px]. truth: see `FitPreset.optimizers`."""
+    """Return a planner with the costs of `terms_of`.
+
+    sigma: standard deviation of the keypoints [px]. truth: see `FitPreset.optimizers`.
+    """
     bounds = np.array([(motor.lower, motor.upper) for motor in scene.motors])
     return Planner(
         dynamics, terms_of(seen, camera, sigma, scene.dt), preset.horizon, preset.knots, scene.dt,
@@ -194,7 +196,7 @@ def planner_of(
 
 
 def started(scene: Scene, wanted: WantedMotion) -> np.ndarray:
-    """The state (L, 13) in which the execution begins: the kinematic start's, on the ground."""
+    """Return the initial state (L, 13) of the execution: the kinematic start's, raised out of the ground if needed."""
     human, state = scene.bodies[0], wanted.states[0].copy()
     sunk = clearance(human, state[None], human.sizes[None])[0]
     state[:, 2] -= min(sunk, 0.0)
@@ -205,7 +207,7 @@ def fit(
     scene: Scene, planner: Planner, wanted: WantedMotion, state: np.ndarray, every: int, seed: int = 0,
     observe: Callable[[Execution], None] = lambda execution: None, begun: Begun | None = None,
 ) -> Execution:  # fmt: skip
-    """Plan and execute in the truth, from a state (L, 13) on, until what is wanted ends; see `mpc.loop.execute`.
+    """Plan and execute the whole wanted motion in the ground truth, from a state (L, 13); see `mpc.loop.execute`.
 
     every: steps between plans.
     """

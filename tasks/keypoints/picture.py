@@ -1,4 +1,4 @@
-"""What a person looks at: keypoints, the figure over them, and the motion from the side."""
+"""Picture of a reconstruction: keypoints, the figure over them, and the motion from the side."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ KINEMATIC, PHYSICAL, SEEN = "#9aa5b1", "#1f6fb2", "#d1495b"
 
 
 def pose_picture(keypoints: Keypoints, camera: Camera, found: np.ndarray, start: np.ndarray, path: Path) -> None:
-    """Some frames of a film, in the image above and from its side below.
+    """Draw some frames of a film, in the image above and from the camera's side below, and write them to a PNG file.
 
-    found, start: points (T, P, 3) [m] of what was executed, and of the kinematic start.
+    found, start: points (T, P, 3) [m] of the executed motion, and of the kinematic start.
     """
     frames = np.linspace(0, len(keypoints) - 1, FRAMES).astype(int)
     drawing = Figure(figsize=(14.0, 6.2), layout="constrained")

@@ -1,4 +1,4 @@
-"""Points of a person that detectors find in images, and where they are on our human."""
+"""Keypoints of a person that detectors find in images: their names and their values in a film."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from larp_model.errors import InputError
 
 SIDES = ("left", "right")
 LIMBS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle", "heel", "toe")
-# What we know of a person, the sides being the person's own; the toe is the tip of the big one.
+# Names of the keypoints, the sides being the person's own; the toe is the tip of the big one.
 POINTS = ("nose", "left_ear", "right_ear", *(f"{side}_{limb}" for limb in LIMBS for side in SIDES))
 # Rows of heels and toes, side by side.
 FEET = [POINTS.index(f"{side}_{end}") for side in SIDES for end in ("heel", "toe")]
@@ -20,11 +20,11 @@ RATES = (5.0, 1000.0)
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Where one person's points are in the images of a film.
+    """Keypoints of one person in the images of a film.
 
     places: (T, P, 2) [px], in the order of `POINTS`, x to the right and y down from the upper left corner; NaN where a
-    point was not found. confidence: (T, P) from 0, not found, to 1. rate: frames a second. size: width and height of
-    the images [px], if they are known. InputError where these do not fit together.
+    point was not detected. confidence: (T, P) from 0, not detected, to 1. rate: frames per second. size: width and
+    height of the images [px], if they are known. Raises an InputError where these do not fit together.
     """
 
     places: np.ndarray
@@ -51,22 +51,22 @@ class Keypoints:
 
     @property
     def seen(self) -> np.ndarray:
-        """Which points were found (T, P)."""
+        """Return a mask (T, P) of the points that were detected."""
         return self.confidence > 0.0
 
     @property
     def times(self) -> np.ndarray:
-        """When the frames were taken (T,) [s], the first at 0."""
+        """Return the times (T,) [s] of the frames, the first at 0."""
         return np.arange(len(self)) / self.rate
 
     def cut(self, first: int, last: int) -> Keypoints:
-        """The frames from `first` to `last`, both included, or what there is of them."""
+        """Return the keypoints of the frames from `first` to `last`, both included, as far as they exist."""
         frames = slice(max(first, 0), last + 1)
         return replace(self, places=self.places[frames], confidence=self.confidence[frames])
 
 
 def interpolated(values: np.ndarray, rate: float, times: np.ndarray) -> np.ndarray:
-    """Values (T, ...), so many a second, at times (N,) [s] from 0 on: in between linearly, and the last from its on."""
+    """Return values (T, ...) of a rate [1/s] interpolated linearly at times (N,) [s] from 0; the last one continues."""
     at = np.minimum(times * rate, len(values) - 1)
     before = at.astype(int)
     share = (at - before).reshape(-1, *(1,) * (values.ndim - 1))

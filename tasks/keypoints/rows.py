@@ -1,4 +1,4 @@
-"""Compiled functions of many rows, a fixed number of them at a time, so that films of any length share one program."""
+"""Calls of compiled functions on a fixed number of rows, so that films of any length share one compiled program."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ ROWS = 48
 
 
 def single(tree: Any) -> Any:
-    """Arrays and numbers as JAX arrays of single precision."""
+    """Return a tree of arrays and numbers as JAX arrays of single precision."""
     return jax.tree.map(lambda each: jnp.asarray(each, jnp.float32), tree)
 
 
 def by_rows(function: Callable[..., Any], *arrays: np.ndarray) -> Any:
-    """What a function of arrays (ROWS, ...) makes of arrays (N, ...)."""
+    """Return the result of a function of arrays (ROWS, ...) on arrays (N, ...), called on ROWS rows at a time."""
     count = len(arrays[0])
     rows = np.minimum(np.arange(-(-count // ROWS) * ROWS), count - 1).reshape(-1, ROWS)
     parts = [function(*single([each[chosen] for each in arrays])) for chosen in rows]

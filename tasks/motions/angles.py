@@ -20,7 +20,11 @@ RATES = (10.0, 1000.0)
 
 
 class _ChildJoint(NamedTuple):
-    """A joint: the link that it carries, its parent's row, its place in the parent's link [m], its turn to a T-pose."""
+    """Joint with the link that it carries.
+
+    parent: row of the parent joint. offset: from the parent's joint [m], in the parent link's frame. turn: rotation
+    to the T-pose.
+    """
 
     name: str
     link: int
@@ -30,7 +34,7 @@ class _ChildJoint(NamedTuple):
 
 
 def load(path: str | Path) -> Motion:
-    """The motion of an npz file with the arguments of `motion` by their names; joints (J,) may be left out."""
+    """Return the motion of an npz file that names its arrays as `motion` its arguments; joints (J,) is optional."""
     path = Path(path)
     require_file("path", path)
     try:
@@ -55,12 +59,12 @@ def motion(
     angles: np.ndarray,
     joints: list[str] | None = None,
 ) -> Motion:
-    """The motion of our human of 1.75 m, by forward kinematics; `skeleton.retarget` gives its angles back.
+    """Return the motion of our human of 1.75 m by forward kinematics; `skeleton.retarget` recovers its angles.
 
     rate: frames a second. position: of the pelvis (T, 3) [m], world frame, z up. orientation: of the pelvis (T, 4), w,
     x, y, z. angles: (T, J, 3) rotation vectors [rad] of the child links' joints, from their parents, in the order of
-    the human's motors or of `joints`, which names the child links. All zero, it stands upright with hanging arms.
-    ValueError where an argument is not of that kind.
+    the human's motors or of `joints`, which names the child links. With all angles zero, the human stands upright with
+    hanging arms. Raises a ValueError where an argument has another shape or value.
     """
     body = human()
     names = [body.links[child].name for child, _, _ in body.motors]
@@ -89,13 +93,13 @@ def motion(
 
 
 def _anchor(body: Body, point: Vector, link: int) -> np.ndarray:
-    """Where a joint's anchor (3,) [m] is in the frame of a link of the body."""
+    """Return a joint's anchor (3,) [m] in the frame of a link of the body."""
     length, radius, _ = body.sizes[link]
     return anchor(point, np.array(length), np.array(radius), body.links[link].axis)
 
 
 def _link_rotations(body: Body, orientation: np.ndarray, angles: np.ndarray) -> list[Rotation]:
-    """World orientations of the links in all frames."""
+    """Return the world orientations of the links in all frames."""
     motors = {child: row for row, (child, _, _) in enumerate(body.motors)}
     found = [Rotation.from_quat(orientation, scalar_first=True)]
     for child, joint in enumerate(body.joints, start=1):
@@ -104,8 +108,8 @@ def _link_rotations(body: Body, orientation: np.ndarray, angles: np.ndarray) -> 
 
 
 def _of_links(body: Body, rate: float, position: np.ndarray, turned: list[Rotation]) -> Motion:
-    """The motion with joints where the human's are, their frames parallel to the world's in a T-pose."""
-    level = {  # which turns hanging arms to a T-pose's
+    """Return the motion with joints at the human's, their frames parallel to the world's in a T-pose."""
+    level = {  # rotation of hanging arms to a T-pose's
         side: Rotation.from_rotvec((0.5 * np.pi * (1.0 if side == "Left" else -1.0), 0.0, 0.0)) for side in SIDES
     }
     links = {link.name: row for row, link in enumerate(body.links)}
@@ -118,13 +122,13 @@ def _of_links(body: Body, rate: float, position: np.ndarray, turned: list[Rotati
         rows.append(_ChildJoint(name, link, place[parent], offset, turn))
 
     def between(link: int) -> np.ndarray:
-        """From the parent's joint to the link's own, in the parent link's frame."""
+        """Return the vector from the parent's joint to the link's own joint, in the parent link's frame."""
         joint = body.joints[link - 1]
         begin = _anchor(body, body.joints[joint.parent - 1].child_anchor, joint.parent) if joint.parent else np.zeros(3)
         return _anchor(body, joint.parent_anchor, joint.parent) - begin
 
     def tip(link: int, along: np.ndarray) -> np.ndarray:
-        """From the link's joint to one end of its axis, in its frame."""
+        """Return the vector from the link's joint to one end of its axis, in the link's frame."""
         size = body.links[link].length
         return 0.5 * size * along - _anchor(body, body.joints[link - 1].child_anchor, link)
 

@@ -1,9 +1,9 @@
-"""BVH files, read strictly as captured motions.
+"""Strict reader and writer of BVH files, as captured motions.
 
 A BVH file is a tree of joints with offsets and, for every frame, the angles of all joints (M. Meredith and S. Maddock,
-"Motion capture file formats explained", 2001). Here its joints go by MotionBuilder's names, as in B. Hahne's conversion
-of the Carnegie Mellon motion capture database; a table for each other skeleton says what its files call them. Files
-have y up and face z; here z is up, x forward and y left.
+"Motion capture file formats explained", 2001). Here its joints have MotionBuilder's names, as in B. Hahne's conversion
+of the Carnegie Mellon motion capture database; a table for each other skeleton gives the names in its files. Files have
+y up and face z; here z is up, x forward and y left.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ BONES = {
     "ToeBase": "toes",
 }
 ASF = {"Head": "head", **{side + name: side[0].lower() + bone for side in SIDES for name, bone in BONES.items()}}
-# What the files of each known skeleton call the joints that we need; Mixamo's names are MotionBuilder's, prefixed.
+# Names of the needed joints in the files of each known skeleton; Mixamo's names are MotionBuilder's, prefixed.
 SKELETONS = {
     "MotionBuilder": {name: name for name in NEEDED},
     "LAFAN1": {name: name.replace("ToeBase", "Toe") for name in NEEDED},
@@ -44,7 +44,7 @@ SKELETONS = {
 # Metres in one unit of a file: the Carnegie Mellon conversions', a centimetre, a metre. The length of the legs decides.
 UNITS = (0.0254 / 0.45, 0.01, 1.0)
 LEG_LENGTH = (0.6, 1.2)
-_OURS = {"X": "Y", "Y": "Z", "Z": "X"}  # a file's axes in our words; positions are reordered accordingly
+_OURS = {"X": "Y", "Y": "Z", "Z": "X"}  # our axis for each of a file's axes; positions are reordered accordingly
 _TO_OURS, _TO_FILE = [2, 0, 1], [1, 2, 0]
 _TURNS = ("Zrotation", "Xrotation", "Yrotation")
 _LARGEST = 1e6
@@ -52,12 +52,12 @@ _PREFIX = re.compile(r"^(.*:|mixamorig\d*_)")  # of a whole skeleton, as in mixa
 
 
 def load(path: str | Path, names: Mapping[str, str] | None = None) -> Motion:
-    """Read a BVH file; InputError, in one line, says what is missing, damaged or not understood.
+    """Read a BVH file; an InputError of one line names what is missing, damaged or not understood.
 
-    names: what the file calls the joints of `NEEDED`, {"Hips": "pelvis", ...}; those left out go by our names. By
-    default, the table of `SKELETONS` that fits the file best. Prefixes, as in mixamorig:Hips, are left out. The rest
+    names: the file's names of the joints of `NEEDED`, {"Hips": "pelvis", ...}; joints left out have our names. By
+    default, the table of `SKELETONS` that fits the file best. Prefixes, as in mixamorig:Hips, are removed. The rest
     pose is the first frame if that is a T-pose, which is then left out, else the pose without rotations if that is
-    one, else what `rest_pose` makes of the frames.
+    one, else the estimate of `rest_pose` from the frames.
     """
     path = Path(path)
     require_file("path", path)
@@ -70,9 +70,10 @@ def load(path: str | Path, names: Mapping[str, str] | None = None) -> Motion:
 
 
 def dumps(motion: Motion) -> str:
-    """A motion as the text of a BVH file in centimetres, by its own joint names; `load` gives it back.
+    """Return a motion as the text of a BVH file in centimetres, with its own joint names; `load` reads it back.
 
-    Every joint turns about z, x and y, in a file's axes; the root moves, too. Bones that carry no joint end 5 cm on.
+    Every joint rotates about z, x and y, in a file's axes; the root also has positions. Bones that carry no joint get
+    an end site 5 cm away.
     """
     children = [np.flatnonzero(motion.parents == row) for row in range(len(motion.names))]
     order: list[int] = []
@@ -106,7 +107,7 @@ def dumps(motion: Motion) -> str:
 
 
 def names_in(path: Path) -> dict[str, str]:
-    """The table of names that a JSON file holds, for `load`."""
+    """Return the table of joint names in a JSON file, for `load`."""
     require_file("names", path)
     try:
         found = json.loads(path.read_bytes())
@@ -118,7 +119,7 @@ def names_in(path: Path) -> dict[str, str]:
 
 
 def _table(names: Mapping[str, str]) -> dict[str, str]:
-    """A user's table, made whole; InputError where it names joints that are not ours, or one joint twice."""
+    """Return a user's table completed with our names; InputError where it has unknown joints or one name twice."""
     if unknown := [str(name) for name in names if name not in NEEDED]:
         raise InputError(f"names has {', '.join(unknown)}, but needs a file's names of {', '.join(NEEDED)}")
     table = {name: _PREFIX.sub("", names.get(name, name)) for name in NEEDED}
@@ -138,7 +139,7 @@ class _Joint:
 
 
 def _parse(lines: list[str]) -> tuple[list[_Joint], float, np.ndarray]:
-    """Joints, seconds a frame and channels (T, C) of a file, in its own unit and axes."""
+    """Return the joints, seconds per frame and channels (T, C) of a file, in its own unit and axes."""
     rows = [(number, line.split()) for number, line in enumerate(lines, start=1) if line.strip()]
     start = next((index for index, (_, words) in enumerate(rows) if words == ["MOTION"]), None)
     if start is None or rows[0][1] != ["HIERARCHY"]:
@@ -171,7 +172,7 @@ def _numbers(words: list[str], count: int, place: str) -> list[float]:
 
 
 def _hierarchy(words: Iterator[str]) -> list[_Joint]:
-    """The tree of joints, parents first. The ends of bones that carry no joint are read and left out."""
+    """Return the tree of joints, parents first; end sites are read and left out."""
     joints: list[_Joint] = []
     line: list[int] = []
 
@@ -209,7 +210,7 @@ def _hierarchy(words: Iterator[str]) -> list[_Joint]:
 
 
 def _named(joints: list[_Joint], tables: list[dict[str, str]]) -> list[_Joint]:
-    """The joints, those that we need under our names, by the first table that leaves the fewest of them out."""
+    """Return the joints, the needed ones renamed to ours by the first table with the fewest missing."""
     found = [joint.name for joint in joints]
     table = min(tables, key=lambda table: len(set(table.values()) - set(found)))
     if missing := {ours: theirs for ours, theirs in table.items() if theirs not in found}:
@@ -218,7 +219,7 @@ def _named(joints: list[_Joint], tables: list[dict[str, str]]) -> list[_Joint]:
             f" {', '.join(missing)}: it has {shorten(', '.join(found), 600)}"
         )
     ours = {theirs: name for name, theirs in table.items()}
-    # Another joint of the file may go by a name that is ours.
+    # Another joint of the file may have a name that is one of ours.
     return [
         replace(joint, name=ours.get(joint.name, f"{joint.name} (other)" if joint.name in NEEDED else joint.name))
         for joint in joints
@@ -226,7 +227,7 @@ def _named(joints: list[_Joint], tables: list[dict[str, str]]) -> list[_Joint]:
 
 
 def _motion(joints: list[_Joint], duration: float, data: np.ndarray) -> Motion:
-    """The motion of all frames, in metres, the joints' frames made parallel in the rest pose."""
+    """Return the motion of all frames, in metres, with joint frames made parallel in the rest pose."""
     poses = np.concatenate([_unturned(joints)[None], data])
     raw = _posed(joints, duration, poses)
     thighs, shins = ([bone(raw, side + joint)[0] for side in SIDES] for joint in ("UpLeg", "Leg"))
@@ -254,7 +255,7 @@ def _motion(joints: list[_Joint], duration: float, data: np.ndarray) -> Motion:
 
 
 def _unturned(joints: list[_Joint]) -> np.ndarray:
-    """The channels (C,) of the pose without rotations; joints that have positions are where their offsets say."""
+    """Return the channels (C,) of the pose without rotations; joints that have positions are at their offsets."""
     found = []
     for joint in joints:
         offset = dict(zip("XYZ", joint.offset if joint.parent >= 0 else (0.0, 0.0, 0.0), strict=True))
@@ -263,7 +264,7 @@ def _unturned(joints: list[_Joint]) -> np.ndarray:
 
 
 def _posed(joints: list[_Joint], duration: float, poses: np.ndarray) -> Motion:
-    """Forward kinematics of the channels (P, C), in our axes but the file's unit and joint frames."""
+    """Return the motion of channels (P, C) by forward kinematics, in our axes but the file's unit and joint frames."""
     turns: list[Rotation] = []
     places: list[np.ndarray] = []
     column = 0

@@ -1,4 +1,4 @@
-"""Motions are said in joints of the lean human; a more detailed one performs them with all that it has."""
+"""Conversion of joint targets of the lean human, in which motions are given, to more detailed humans."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from larp_model.scene import Body
 
 
 def in_detail(body: Body, targets: np.ndarray) -> np.ndarray:
-    """Joint targets (*, J, 3) [rad] of a human for those of the lean one (*, 12, 3).
+    """Return joint targets (*, J, 3) [rad] of a human, from those of the lean one (*, 12, 3).
 
-    Joints in a row share a turn; what the lean human has not stays at rest.
+    Joints of a chain share a rotation equally; targets of joints that the lean human lacks are zero.
     """
     if detail_of(body) == "lean":
         return targets

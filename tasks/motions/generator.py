@@ -1,4 +1,4 @@
-"""Truth episodes of any human in any motion, who may meet a ball: what breadth is learned from."""
+"""Ground-truth episodes of humans of any size in any motion, who may strike a ball: training data of wide coverage."""
 
 from __future__ import annotations
 
@@ -21,15 +21,16 @@ from tasks.motions.references import Reference, clearance, standing_on_ground
 KICKS, GAITS = 0.45, 0.3
 # Kicks begin anywhere in the first steps of the reference.
 BEGUN = 120
-# Engine steps that are enough to see where a foot will pass.
+# Engine steps per step of the scene that suffice to predict the path of a foot.
 COARSE = 5
 
 
 def any_episodes(scene: Scene, reference: Reference, count: int, seed: int, steps: int = STEPS) -> tuple[Episodes, int]:
-    """Episodes of humans of every size in motion, under their targets plus smooth noise; some with pushes from outside.
+    """Return episodes of humans of every size in motion, and how many were dropped.
 
-    What the human may strike, if anything, waits where a foot will pass, or comes from anywhere. Returns
-    them, and how many were dropped because they began with one leg in the other, or diverged.
+    Joint targets have smooth noise added; some episodes have external pushes. The body that the human may strike, if
+    any, rests where a foot will pass, or comes from anywhere. Episodes are dropped that begin with overlapping legs, or
+    diverge.
     """
     random = np.random.default_rng(seed)
     sizes = random_people(random, scene, count)
@@ -55,10 +56,10 @@ def any_episodes(scene: Scene, reference: Reference, count: int, seed: int, step
 def in_motion(
     random: np.random.Generator, scene: Scene, reference: Reference, sizes: np.ndarray, steps: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """States (N, L, 13) of humans of sizes (N, L, 3) in motion, and joint targets (N, steps, J, 3) [rad] to go on with.
+    """Return initial states (N, L, 13) of humans in motion, and their joint targets (N, steps, J, 3) [rad].
 
-    Kicks begin as the reference was, all else in the pose of the first targets, often with one foot standing. Every
-    other one is mirrored. What is struck is far away.
+    sizes: (N, L, 3). Kicks begin in states of the reference, other motions in the pose of their first targets, often
+    with one foot standing. Half of them, at random, are mirrored. All other bodies are far away.
     """
     human, rows, count = scene.body("human"), scene.rows("human"), len(sizes)
     kicking, walking = round(KICKS * count), round(GAITS * count)
@@ -91,9 +92,9 @@ def in_motion(
 
 
 def spins(random: np.random.Generator, human: Body, states: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Angular velocities (N, n, 3) [rad/s] of links in states (N, n, 13) whose joints turn with rates (N, J, 3).
+    """Return angular velocities (N, n, 3) [rad/s] of links in states (N, n, 13), from joint rates (N, J, 3) [rad/s].
 
-    Some are slower than that, or stand.
+    Each state scales the rates by a random factor from 0 to 1.2; the root's angular velocity is random.
     """
     found, motors = np.zeros((*states.shape[:2], 3)), styles.rows_of(human)
     eager = random.uniform(0.0, 1.2, (len(states), 1))
@@ -106,7 +107,7 @@ def spins(random: np.random.Generator, human: Body, states: np.ndarray, rates: n
 
 
 def disturbed(random: np.random.Generator, states: np.ndarray) -> np.ndarray:
-    """States (N, n, 13) whose links are turned by chance, spin and fly, each state more or less so."""
+    """Return states (N, n, 13) with random rotations and velocities added, of a random size in each state."""
     found, (count, links) = states.copy(), states.shape[:2]
     size = np.where(random.random(count) < 0.2, 0.0, random.uniform(0.0, 1.0, count))[:, None, None]
     tilt = Rotation.from_rotvec((0.08 * size * random.standard_normal((count, links, 3))).reshape(-1, 3))
@@ -118,7 +119,7 @@ def disturbed(random: np.random.Generator, states: np.ndarray) -> np.ndarray:
 
 
 def planted(random: np.random.Generator, human: Body, states: np.ndarray) -> np.ndarray:
-    """States (N, n, 13), in most of which the lower foot's centre rests, or nearly so; the others go anywhere."""
+    """Return states (N, n, 13), most with the lower foot's centre nearly at rest, the others moving anywhere."""
     found, count = states.copy(), np.arange(len(states))
     sides = np.array([human.link("left_foot"), human.link("right_foot")])
     foot = sides[np.argmin(found[:, sides, 2], axis=1)]
@@ -132,7 +133,7 @@ def planted(random: np.random.Generator, human: Body, states: np.ndarray) -> np.
 def feet(
     random: np.random.Generator, scene: Scene, states: np.ndarray, targets: np.ndarray, sizes: np.ndarray
 ) -> np.ndarray:
-    """Where (N, T, 3) [m] one of either human's feet goes, in a first coarse look."""
+    """Return the path (N, T, 3) [m] of a random foot of each human, from a coarse rollout."""
     names = np.where(random.random(len(states)) < 0.5, "left_foot", "right_foot")
     rows = np.array([scene.index("human", str(name)) for name in names])
     alone = scene.only("human")

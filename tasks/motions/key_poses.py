@@ -1,7 +1,7 @@
 """Key poses of the embedded kick: plant, backswing, strike, follow-through, landing, stance.
 
-Their numbers are in `key_poses.json`: authored by hand, then refined in the truth by `tasks.refine`, which writes the
-file.
+Their numbers are in `key_poses.json`: authored by hand, then refined in the ground truth by `tasks.refine`, which
+writes the file.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ FILE = Path(__file__).with_suffix(".json")
 
 @dataclass(frozen=True)
 class KeyPoses:
-    """Joint targets at a few moments, and how the kick begins.
+    """Joint targets at a few times, and the initial state of the kick.
 
     times: (K,) [s]. angles: by joint and axis (0 rolls about x, 1 pitches about y, 2 yaws about z), the component of
-    the joint's rotation vector at each time [rad]. lean: of the pelvis about x and y at first [rad]. velocity: of the
-    whole body at first [m/s]. ball: where it rests on the ground, from below the pelvis [m].
+    the joint's rotation vector at each time [rad]. lean: initial lean of the pelvis about x and y [rad]. velocity:
+    initial velocity of the whole body [m/s]. ball: its place on the ground relative to the point below the pelvis [m].
     """
 
     times: tuple[float, ...]
@@ -36,7 +36,7 @@ class KeyPoses:
     ball: tuple[float, float]
 
     def controls(self, body: Body, steps: int, dt: float) -> np.ndarray:
-        """Joint targets (steps, J, 3) [rad] of the body, monotone between key poses; the last pose is held."""
+        """Return the body's joint targets (steps, J, 3) [rad], monotone between key poses, constant after the last."""
         lean = human()
         names = [lean.links[child].name for child, _, _ in lean.motors]
         times = np.minimum(np.arange(steps) * dt, self.times[-1])
@@ -48,7 +48,7 @@ class KeyPoses:
 
 
 def load(path: Path = FILE) -> KeyPoses:
-    """Read key poses."""
+    """Read key poses from a JSON file in the form that `dumps` writes."""
     content = json.loads(path.read_text())
     angles = {(joint, int(axis)): tuple(row) for joint, axes in content["angles"].items() for axis, row in axes.items()}
     start = {name: tuple(content[name]) for name in ("lean", "velocity", "ball")}
@@ -56,7 +56,7 @@ def load(path: Path = FILE) -> KeyPoses:
 
 
 def dumps(poses: KeyPoses) -> str:
-    """Key poses as the text that `load` reads, three decimals, a line for each joint's axis."""
+    """Return key poses as the text that `load` reads, with three decimals and one line per joint axis."""
 
     def numbers(values: tuple[float, ...]) -> str:
         return "[" + ", ".join(f"{value + 0.0:.3f}" for value in values) + "]"

@@ -1,4 +1,4 @@
-"""Bodies to learn from: humans of every size, no two alike."""
+"""Random morphologies of humans, for training data."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import numpy as np
 from larp_model.bodies import detail_of, human, segment_of
 from larp_model.scene import Scene
 
-# Heights [m], masses [kg], and which masses go with a height: mass / height^2 [kg/m^2].
+# Ranges of height [m], of mass [kg], and of mass / height^2 [kg/m^2].
 HEIGHT, MASS, BUILD = (1.5, 2.0), (45.0, 110.0), (16.0, 38.0)
 # Lengths and radii of single segments differ by up to this share.
 VARIED = 0.15
 
 
 def random_people(random: np.random.Generator, scene: Scene, count: int) -> np.ndarray:
-    """Morphologies (count, L, 3) of the scene, its human another one in each; both sides of a human are alike."""
+    """Return morphologies (count, L, 3) of the scene, each with another human; left and right are alike."""
     sizes = np.broadcast_to(scene.morphology, (count, len(scene.links), 3)).astype(float)
     usual = human(detail=detail_of(scene.body("human")))
     segments = [segment_of(link.name) for link in usual.links]

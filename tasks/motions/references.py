@@ -1,4 +1,4 @@
-"""Reference kicks: the project's own, authored as key poses and refined in the truth."""
+"""Reference kicks: the embedded one, from key poses, and captured ones, both performed in the ground truth."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tasks.motions.key_poses import KeyPoses
 from tasks.motions.skeleton import Motion
 from tasks.motions.tracking import Tracker
 
-# Steps around the strike in which a captured kick may meet its ball.
+# Steps around the strike in which a captured kick may hit its ball.
 MEETING = 10
 # Least height of the hips above the lower foot at the strike, as a share of the rest pose's.
 STANDING = 0.5
@@ -30,9 +30,9 @@ STANDING = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """A kick to stay near to, as the servo-driven human performs it in the truth.
+    """Kick that plans stay near to, as the servo-driven human performs it in the ground truth.
 
-    states: (T + 1, L, 13) of the whole scene, world frame, the human's pelvis above the origin at first, facing x.
+    states: (T + 1, L, 13) of the whole scene, world frame, the human's pelvis initially above the origin, facing x.
     controls: (T, J, 3) joint targets [rad]. strike: the step in which the foot first pushes the ball.
     """
 
@@ -42,11 +42,14 @@ class Reference:
 
     @property
     def ball_spot(self) -> np.ndarray:
-        """Where the ball's centre rests before the kick (3,) [m]."""
+        """Return the position (3,) [m] of the ball's centre before the kick."""
         return self.states[0, -1, packed.POSITION]
 
     def window(self, start: int, steps: int) -> tuple[np.ndarray, np.ndarray]:
-        """States (steps, L, 13) after each step and controls (steps, J, 3) from step `start`; the last is held."""
+        """Return states (steps, L, 13) after each step and controls (steps, J, 3), from step `start`.
+
+        Beyond the end, the last step repeats.
+        """
         rows = np.minimum(np.arange(start, start + steps), len(self.controls) - 1)
         return self.states[rows + 1], self.controls[rows]
 
@@ -54,7 +57,7 @@ class Reference:
 def standing_on_ground(
     scene: Scene, targets: np.ndarray, root: Rotation, morphology: np.ndarray | None = None
 ) -> np.ndarray:
-    """States (N, L, 13) at rest, the human in the poses of joint targets (N, J, 3) [rad], standing on the ground.
+    """Return states (N, L, 13) at rest, the human on the ground in the poses of joint targets (N, J, 3) [rad].
 
     root: N orientations of the pelvis, which is above the origin. morphology: (N, L, 3); the scene's by default.
     """
@@ -77,7 +80,7 @@ def standing_on_ground(
 
 
 def clearance(body: Body, states: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """How high (N,) [m] the lowest link of a body in states (N, n, 13), of sizes (N, n, 3), is above the ground."""
+    """Return the height (N,) [m] above the ground of a body's lowest link, in states (N, n, 13), sizes (N, n, 3)."""
     return np.min(
         [states[:, row, 2] - resting(link, states[:, row], sizes[:, row]) for row, link in enumerate(body.links)],
         axis=0,
@@ -85,7 +88,7 @@ def clearance(body: Body, states: np.ndarray, sizes: np.ndarray) -> np.ndarray:
 
 
 def resting(link: Link, states: np.ndarray, sizes: np.ndarray | None = None) -> np.ndarray:
-    """Height (N,) [m] at which a link in states (N, 13) touches the ground, turned as it is.
+    """Return the height (N,) [m] at which a link touches the ground in the orientations of states (N, 13).
 
     sizes: (N, 3) length, radius and mass; the link's by default.
     """
@@ -95,7 +98,7 @@ def resting(link: Link, states: np.ndarray, sizes: np.ndarray | None = None) -> 
 
 
 def starts(scene: Scene, poses: Sequence[KeyPoses]) -> np.ndarray:
-    """The states (N, L, 13) in which kicks of key poses begin; the ball is as far away as the human is tall."""
+    """Return initial states (N, L, 13) of kicks of key poses; the ball's distance scales with the human's height."""
     human, ball = scene.bodies[0], scene.bodies[-1]
     size = standing_height(human) / standing_height(bodies.human(detail=bodies.detail_of(human)))
     first = np.concatenate([each.controls(human, 1, scene.dt) for each in poses])
@@ -106,7 +109,10 @@ def starts(scene: Scene, poses: Sequence[KeyPoses]) -> np.ndarray:
 
 
 def embedded(scene: Scene, steps: int = 300, poses: KeyPoses | None = None) -> Reference:
-    """The embedded kick, performed in the truth by the human of `scene` (its first body; its last is the ball)."""
+    """Return the embedded kick, performed in the ground truth by the human of `scene`.
+
+    The human is the scene's first body, the ball its last.
+    """
     poses = key_poses.load() if poses is None else poses
     controls, state = poses.controls(scene.bodies[0], steps, scene.dt), starts(scene, [poses])[0]
     truth = Truth(scene)
@@ -121,7 +127,7 @@ def embedded(scene: Scene, steps: int = 300, poses: KeyPoses | None = None) -> R
 
 
 def motion_of(path: Path, names: Mapping[str, str] | None = None) -> Motion:
-    """The motion of a BVH file or of an npz file; see `captured`."""
+    """Return the motion of a BVH file or of an npz file; see `captured`."""
     if path.suffix.lower() != ".npz":
         return bvh.load(path, names)
     if names is not None:
@@ -136,13 +142,13 @@ def captured(
     seconds_after: float = 1.0,
     names: Mapping[str, str] | None = None,
 ) -> Reference:
-    """A captured kick, performed in the truth by the human of `scene`, who follows it around its strike.
+    """Return a captured kick, performed in the ground truth by the human of `scene`, who tracks it around its strike.
 
-    source: a BVH file, an npz file of joint angles (see `angles.load`), or a motion. The ball waits where the foot, as
-    performed, would strike it hardest. The whole is turned and moved so that the ball leaves along the x axis (the
-    human starts beside it), and mirrored if the kicking foot is the left. names: what a BVH file calls our joints, as
-    in `bvh.load`; by default, the known skeleton that fits it. InputError where the file is not understood, is no
-    kick, or no ball is hit.
+    source: a BVH file, an npz file of joint angles (see `angles.load`), or a motion. The ball is placed where the foot,
+    as performed, strikes it hardest. The result is rotated and moved so that the ball leaves along the x axis (the
+    human starts beside it), and mirrored if the kicking foot is the left. names: a BVH file's names of our joints, as
+    in `bvh.load`; by default, those of the known skeleton that fits it. Raises an InputError where the file is not
+    understood, is no kick, or no ball is hit.
     """
     for name, value in (("seconds_before", seconds_before), ("seconds_after", seconds_after)):
         if not 0.2 <= value <= 10.0:
@@ -174,7 +180,10 @@ def captured(
 
 
 def require_kick(path: str | Path, motion: Motion, strike: int, dt: float) -> None:
-    """Refuse a motion that begins too late before its strike, a frame of it, or whose person does not stand there."""
+    """Raise an InputError if a motion begins too late before its strike, or its person does not stand then.
+
+    strike: a frame of the motion. dt: the scene's time step [s].
+    """
     before, needed = strike / motion.rate, (MEETING + 1) * dt
     if before < needed:
         raise InputError(
@@ -190,7 +199,7 @@ def require_kick(path: str | Path, motion: Motion, strike: int, dt: float) -> No
 
 
 def _launched_along_x(states: np.ndarray, strike: int) -> np.ndarray:
-    """The states (T, L, 13), turned about z and moved along y so that the ball leaves along the x axis."""
+    """Return the states (T, L, 13), rotated about z and moved along y so that the ball leaves along the x axis."""
     x, y, _ = states[min(strike + MEETING, len(states) - 1), -1, packed.VELOCITY]
     turned = turned_about_z(states, -np.arctan2(y, x))
     turned[..., 1] -= turned[0, -1, 1]
@@ -198,7 +207,7 @@ def _launched_along_x(states: np.ndarray, strike: int) -> np.ndarray:
 
 
 def _wanted(scene: Scene, clip: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """The clip as states (T, L, 13) and joint targets (T, J, 3) [rad] of the human, its ball out of the way."""
+    """Return the clip as states (T, L, 13) and joint targets (T, J, 3) [rad] of the human, the ball out of reach."""
     human, ball = scene.bodies[0], scene.bodies[-1]
     orientations, lean = skeleton.retarget(clip, bodies.human(), scene.dt)
     poses = in_detail(human, lean)
@@ -217,7 +226,7 @@ def _wanted(scene: Scene, clip: Motion) -> tuple[np.ndarray, np.ndarray]:
 
 
 def spinning(states: np.ndarray, dt: float) -> np.ndarray:
-    """The states (T, L, 13), with the angular velocities that take each link from one step to the next."""
+    """Return the states (T, L, 13) with the angular velocities that rotate each link from one step to the next."""
     spun = states.copy()
     for row in range(states.shape[1]):
         turned = Rotation.from_quat(states[:, row, packed.ORIENTATION], scalar_first=True)
@@ -227,13 +236,13 @@ def spinning(states: np.ndarray, dt: float) -> np.ndarray:
 
 
 def leading(scene: Scene, poses: np.ndarray) -> np.ndarray:
-    """Joint targets (T, J, 3) [rad] whose servos hold these angles: ahead by their lag, damping / stiffness."""
+    """Return joint targets (T, J, 3) [rad] that lead the angles by the servos' lag, damping / stiffness."""
     lag = np.array([motor.damping / motor.stiffness for motor in scene.motors])[:, None]
     return poses + lag * np.gradient(poses, scene.dt, axis=0)
 
 
 def _importance(scene: Scene, steps: int, strike: int) -> np.ndarray:
-    """How much it matters where each link is (T, L): pelvis and feet more, the kicking foot near the strike most."""
+    """Return position weights (T, L) of links: higher for pelvis and feet, highest for the kicking foot at strike."""
     human = scene.bodies[0]
     pelvis, left, right = (scene.index(human.name, link) for link in ("pelvis", "left_foot", "right_foot"))
     weights = np.zeros((steps, len(scene.links)))
@@ -244,7 +253,7 @@ def _importance(scene: Scene, steps: int, strike: int) -> np.ndarray:
 
 
 def _spot(path: str | Path, scene: Scene, states: np.ndarray, strike: int) -> tuple[np.ndarray, int]:
-    """Where a ball (3,) [m] just touches the right foot, ahead of its middle, and in which step near the strike."""
+    """Return the ball's position (3,) [m] just ahead of the right foot, and the step near the strike of the touch."""
     human, radius = scene.bodies[0], scene.bodies[-1].links[0].radius
     foot = human.links[human.link("right_foot")]
     way = states[:, scene.index(human.name, "right_foot")]

@@ -1,7 +1,8 @@
-"""The rest pose of a skeleton that shows none: how its joints' frames are turned in a T-pose, told by how it moves.
+"""Rest pose of a skeleton whose file has none: orientations of its joint frames in a T-pose, estimated from its motion.
 
-What a T-pose fixes of a limb is where its bone points and about which axis the next one bends: knees bend shins
-backwards, elbows bend forearms forwards, palms down. Both are constant in the limb's own frame, and seen in any motion.
+A T-pose fixes two things of a limb: the direction of its bone and the axis about which the next bone bends. Knees bend
+shins backwards, elbows bend forearms forwards, palms down. Both are constant in the limb's own frame, and can be
+measured in any motion.
 """
 
 from __future__ import annotations
@@ -13,15 +14,16 @@ from larp_model.errors import InputError
 from tasks.motions.skeleton import ENDS, SIDES, Motion, bone
 
 FORWARDS, LEFT, UP = np.eye(3)
-# Fewest frames to tell from. A limb whose bones are never further from parallel, on average, shows no hinge [rad].
+# Fewest frames for an estimate. A limb with a smaller mean bend [rad] gives no hinge axis.
 FRAMES, STRAIGHT = 10, 0.05
 
 
 def resting(motion: Motion) -> Rotation:
-    """Orientations of the n joints' frames in a T-pose, the person facing x; `motion` in its file's joint frames.
+    """Return orientations of the n joint frames in a T-pose, the person facing x; `motion` is in its file's frames.
 
-    Torso and pelvis have the mean lean of the motion, feet are as steep as with the ankle lowest, and all else (neck,
-    hands, ...) is turned to its parent as it is on average. InputError where there are too few frames.
+    Torso and pelvis have the mean lean of the motion, feet are as steep as with the ankle lowest, and all other joints
+    (neck, hands, ...) have their mean orientation relative to the parent. Raises an InputError where there are too few
+    frames.
     """
     if len(motion.positions) < FRAMES:
         raise InputError(
@@ -51,14 +53,17 @@ def resting(motion: Motion) -> Rotation:
 
 
 def across(motion: Motion, name: str, limbs: str, upwards: np.ndarray) -> Rotation:
-    """The frame of a joint from which limbs branch off to left and right; upwards (T, 3) points up as far as it can."""
+    """Return the frame of a joint from which limbs branch off to left and right.
+
+    upwards: (T, 3) vectors that the frame makes point up as far as it can.
+    """
     back = motion.rotation(name).inv()
     sideways = motion.path(f"Left{limbs}") - motion.path(f"Right{limbs}")
     return turned((mean(back, sideways), LEFT), (mean(back, upwards), UP))
 
 
 def limb(motion: Motion, side: str, part: str, usual: Rotation) -> Rotation:
-    """The frame of a limb's joint whose bone points down, or to its side if it is an arm's."""
+    """Return the frame of a limb's joint whose bone points down, or to its side if it is an arm's."""
     outwards = LEFT if side == "Left" else -LEFT
     arm = "Arm" in part
     along = mean(motion.rotation(side + part).inv(), bone(motion, side + part)), outwards if arm else -UP
@@ -69,7 +74,10 @@ def limb(motion: Motion, side: str, part: str, usual: Rotation) -> Rotation:
 
 
 def foot(motion: Motion, side: str, usual: Rotation) -> Rotation:
-    """The frame of a foot's joint, the foot as steep as it is when the ankle is lowest: toes are when they push off."""
+    """Return the frame of a foot's joint, the foot as steep as with the ankle lowest.
+
+    The toes are lowest at another time, when they push off.
+    """
     ankle = motion.path(f"{side}Foot")
     way, height = motion.path(f"{side}ToeBase") - ankle, ankle[:, 2]
     fall = np.median((-way[:, 2] / np.linalg.norm(way, axis=-1))[height <= np.quantile(height, 0.25)])
@@ -82,19 +90,22 @@ def foot(motion: Motion, side: str, usual: Rotation) -> Rotation:
 
 
 def hinge(motion: Motion, side: str, part: str, arm: bool) -> np.ndarray:
-    """The axis (3,) of knee or elbow in the frame of a limb's joint, as long as the limb is bent [rad] on average."""
+    """Return the axis (3,) of knee or elbow in the frame of a limb's joint; its length is the mean bend [rad]."""
     upper, lower = (bone(motion, side + name) for name in (("Arm", "ForeArm") if arm else ("UpLeg", "Leg")))
     bent = np.cross(upper, lower) / (np.linalg.norm(upper, axis=-1) * np.linalg.norm(lower, axis=-1))[:, None]
     return mean(motion.rotation(side + part).inv(), bent)
 
 
 def mean(back: Rotation, vectors: np.ndarray) -> np.ndarray:
-    """Vectors (T, 3) of the world as a joint's frame sees them, on average (3,)."""
+    """Return the mean (3,) of world vectors (T, 3) in a joint's frame; back: rotations from world to joint frame."""
     return back.apply(vectors).mean(axis=0)
 
 
 def turned(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray] | None = None) -> Rotation:
-    """The turn that brings a vector to where another points, and a second one as near to its own as it then can."""
+    """Return the rotation that takes a vector to the direction of another, and a second pair as near as it then can.
+
+    first, second: (vector, direction that it is to have).
+    """
     pairs = [first] if second is None else [first, second]
     given, wanted = (np.array([each / np.linalg.norm(each) for each in side]) for side in zip(*pairs, strict=True))
     found, _ = Rotation.align_vectors(wanted, given, None if second is None else [np.inf, 1.0])

@@ -1,4 +1,4 @@
-"""Captured motions: joints over time, mirrored, judged, and retargeted to the human of 13 links."""
+"""Captured motions: joint trajectories, with mirroring, kick analysis, and retargeting to the human of 13 links."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LIMBS = {"upper_arm": "Arm", "lower_arm": "ForeArm", "thigh": "UpLeg", "shin": "
 # Where a limb's bone ends; in the human's rest pose these bones hang straight down.
 ENDS = {"Arm": "ForeArm", "ForeArm": "Hand", "UpLeg": "Leg", "Leg": "Foot"}
 NEEDED = [*JOINTS.values(), *(side + name for side in SIDES for name in (*LIMBS.values(), "Hand", "ToeBase"))]
-# How far the arms and legs of a T-pose may be from level and upright [rad].
+# Largest angle of the arms of a T-pose from level, and of its legs from vertical [rad].
 T_POSE = 0.6
 # Frames over which a speed is fitted.
 SMOOTHING = 5
@@ -28,7 +28,7 @@ SLOWEST_KICK = 6.0
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A captured motion of n joints over T frames, in the world frame.
+    """Captured motion of n joints over T frames, in the world frame.
 
     As in a `Body`, all joint frames are parallel to the world's in the rest pose, in which the person faces x.
     names: of the joints, parents first. parents: (n,), -1 for the root. offsets: (n, 3) from the parent's joint, in
@@ -44,32 +44,32 @@ class Motion:
     orientations: np.ndarray
 
     def path(self, name: str) -> np.ndarray:
-        """Where a joint is (T, 3) [m]."""
+        """Return the positions (T, 3) [m] of a joint."""
         return self.positions[:, self.names.index(name)]
 
     def rotation(self, name: str) -> Rotation:
-        """How a joint's frame is turned in each of the T frames."""
+        """Return the orientations of a joint's frame in all T frames."""
         return Rotation.from_quat(self.orientations[:, self.names.index(name)], scalar_first=True)
 
     def cut(self, first: int, last: int) -> Motion:
-        """The frames from `first` to `last`, both included, or what there is of them."""
+        """Return the motion of the frames from `first` to `last`, both included, as far as they exist."""
         frames = slice(max(first, 0), last + 1)
         return replace(self, positions=self.positions[frames], orientations=self.orientations[frames])
 
     @property
     def hip_height(self) -> float:
-        """Of the hips above the toes' base in the rest pose [m]."""
+        """Return the height [m] of the hips above the toes' base in the rest pose."""
         hips, toes = (self.offsets[self._lineage(joint), 2].sum() for joint in ("Hips", "LeftToeBase"))
         return float(hips - toes)
 
     @property
     def chest(self) -> str:
-        """The joint at which the arms branch off the spine."""
+        """Return the name of the joint at which the arms branch off the spine."""
         left, right = self._lineage("LeftArm"), self._lineage("RightArm")
         return self.names[next(joint for joint in left if joint in right)]
 
     def _lineage(self, name: str) -> list[int]:
-        """A joint, its parent and so on, up to the root."""
+        """Return the indices of a joint, its parent and so on, up to the root."""
         line = [self.names.index(name)]
         while line[-1] > 0:
             line.append(int(self.parents[line[-1]]))
@@ -77,18 +77,19 @@ class Motion:
 
 
 def bone(motion: Motion, joint: str) -> np.ndarray:
-    """From a limb's joint to the end of its bone (T, 3) [m]."""
+    """Return the vector (T, 3) [m] from a limb's joint to the end of its bone."""
     side = next(side for side in SIDES if joint.startswith(side))
     return motion.path(side + ENDS[joint.removeprefix(side)]) - motion.path(joint)
 
 
 def facing(motion: Motion, frame: int) -> Rotation:
-    """The turn about z that makes the person face x."""
+    """Return the rotation about z that makes the person face x."""
     x, y, _ = (motion.path("LeftUpLeg") - motion.path("RightUpLeg"))[frame]
     return Rotation.from_rotvec((0.0, 0.0, np.arctan2(x, y)))
 
 
 def is_t_pose(motion: Motion, frame: int) -> bool:
+    """Return whether the arms point outwards and the legs down in a frame, each within `T_POSE` [rad]."""
     straight = facing(motion, frame)
     for side, outwards in zip(SIDES, (1.0, -1.0), strict=True):
         for joint in ENDS:
@@ -100,7 +101,7 @@ def is_t_pose(motion: Motion, frame: int) -> bool:
 
 
 def mirrored(motion: Motion) -> Motion:
-    """The motion in a mirror, the plane y = 0: left and right change places."""
+    """Return the motion mirrored in the plane y = 0, with left and right exchanged."""
     other = {"Left": "Right", "Right": "Left", "L": "R", "R": "L", "l": "r", "r": "l"}
     opposite = [re.sub("^(Left|Right|[LRlr])", lambda side: other[side[1]], name) for name in motion.names]
     return replace(
@@ -113,11 +114,11 @@ def mirrored(motion: Motion) -> Motion:
 
 
 def retarget(motion: Motion, body: Body, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """The motion as poses of our human, every `dt` [s].
+    """Return the motion as poses of our human, every `dt` [s].
 
-    Every link takes its joint's turn from the rest pose, on top of the turn that brings its bone from where it points
-    in the human's rest pose (limbs hang straight down) to where it points in the clip's (arms level). So limbs point
-    as the clip's do, whatever the proportions, and twist as its joints do. Feet are flat in both rest poses.
+    Every link takes its joint's rotation from the rest pose, after the rotation that takes its bone from its direction
+    in the human's rest pose (limbs hang straight down) to that in the clip's (arms level). So limbs point as the clip's
+    do, whatever the proportions, and twist as its joints do. Feet are flat in both rest poses.
 
     Returns the root's orientation (T', 4), w, x, y, z, and the joints' rotation vectors (T', J, 3) [rad], within the
     motors' bounds.
@@ -137,7 +138,7 @@ def retarget(motion: Motion, body: Body, dt: float) -> tuple[np.ndarray, np.ndar
 
 
 def _link_rotation(motion: Motion, link: str) -> Rotation:
-    """World orientations of the link in all frames."""
+    """Return the world orientations of the link in all frames."""
     side, _, segment = link.partition("_")
     if segment not in LIMBS:
         if link != "torso" and link not in JOINTS:
@@ -153,9 +154,9 @@ def _link_rotation(motion: Motion, link: str) -> Rotation:
 
 
 def toe_velocity(motion: Motion, side: str) -> np.ndarray:
-    """Velocity (T, 3) [m/s] of the toes' base of one side, "Left" or "Right".
+    """Return the velocity (T, 3) [m/s] of the toes' base of one side, "Left" or "Right".
 
-    The slope of a parabola fitted to 5 frames (Savitzky and Golay), which evens out a marker that jumps in one frame.
+    It is the slope of a parabola fitted to 5 frames (Savitzky and Golay), which damps a marker that jumps in one frame.
     """
     from scipy.signal import savgol_filter  # half a second to import; the embedded kick has no need of it
 
@@ -165,15 +166,15 @@ def toe_velocity(motion: Motion, side: str) -> np.ndarray:
 
 
 def kicking_side(motion: Motion) -> str:
-    """The side, "Left" or "Right", whose toes become faster."""
+    """Return the side, "Left" or "Right", whose toes reach the higher speed."""
     return max(reversed(SIDES), key=lambda side: np.linalg.norm(toe_velocity(motion, side), axis=-1).max())
 
 
 def toe_speed(motion: Motion) -> np.ndarray:
-    """Speed (T,) [m/s] of the kicking foot's toes' base, smoothed as in `toe_velocity`."""
+    """Return the speed (T,) [m/s] of the toes' base of the kicking foot, smoothed as in `toe_velocity`."""
     return np.linalg.norm(toe_velocity(motion, kicking_side(motion)), axis=-1)
 
 
 def strike(motion: Motion) -> int:
-    """The frame in which the kicking toe is fastest."""
+    """Return the frame in which the kicking toe is fastest."""
     return int(toe_speed(motion).argmax())

@@ -1,4 +1,4 @@
-"""Joint targets of many motions: kicks bent out of the embedded one, walks and runs, moves from pose to pose.
+"""Joint targets of many motions: variations of the embedded kick, walks and runs, moves from pose to pose.
 
 Angles are components of rotation vectors: about x a limb rolls, about y it pitches (a thigh forwards is negative, a
 knee bends positive), about z it yaws; see `bodies`.
@@ -17,23 +17,23 @@ from tasks.motions import key_poses
 
 
 def rows_of(body: Body) -> dict[str, int]:
-    """The row of every motor in the control, by its link."""
+    """Return the row of every motor in the control, by the name of its child link."""
     return {body.links[child].name: row for row, (child, _, _) in enumerate(body.motors)}
 
 
 def limits(body: Body) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of the joint targets, (J, 3) [rad] each."""
+    """Return the lower and upper bounds of the joint targets, (J, 3) [rad] each."""
     motors = [motor for _, _, motor in body.motors]
     return np.array([motor.lower for motor in motors]), np.array([motor.upper for motor in motors])
 
 
 def mirrored(body: Body, targets: np.ndarray) -> np.ndarray:
-    """The targets (*, J, 3) [rad] with left and right exchanged."""
+    """Return the joint targets (*, J, 3) [rad] with left and right exchanged."""
     return targets[..., _opposite(list(rows_of(body))), :] * (-1.0, 1.0, -1.0)
 
 
 def reflected(body: Body, states: np.ndarray) -> np.ndarray:
-    """The states (*, n, 13) with left and right exchanged, in the plane y = 0."""
+    """Return the states (*, n, 13) mirrored in the plane y = 0, with left and right exchanged."""
     found = states[..., _opposite([link.name for link in body.links]), :].copy()
     found[..., [1, 8]] *= -1.0  # y of position and velocity
     found[..., packed.ORIENTATION] *= (1.0, -1.0, 1.0, -1.0)
@@ -42,14 +42,17 @@ def reflected(body: Body, states: np.ndarray) -> np.ndarray:
 
 
 def _opposite(names: list[str]) -> list[int]:
-    """Which of the names each has on its other side."""
+    """Return, for each name, the index of the same part on the other side."""
     other = {"left": "right", "right": "left"}
     parts = (name.partition("_") for name in names)
     return [names.index(other.get(side, side) + line + rest) for side, line, rest in parts]
 
 
 def kicks(random: np.random.Generator, body: Body, begin: np.ndarray, steps: int, dt: float) -> np.ndarray:
-    """The embedded kick (N, steps, J, 3), from a step of it (N,) on, each time bent, and slower or faster."""
+    """Return joint targets (N, steps, J, 3) [rad] of variations of the embedded kick.
+
+    begin: (N,) step of the kick from which each starts. Each has random offsets of its key poses and a random pace.
+    """
     poses, rows = key_poses.load(), rows_of(body)
     times = np.array(poses.times)
     authored = np.zeros((len(times), len(rows), 3))
@@ -66,9 +69,10 @@ def kicks(random: np.random.Generator, body: Body, begin: np.ndarray, steps: int
 
 
 def gaits(random: np.random.Generator, body: Body, count: int, steps: int, dt: float) -> np.ndarray:
-    """Walks, runs and steps on the spot (N, steps, J, 3): every joint swings at the same pace.
+    """Return joint targets (N, steps, J, 3) [rad] of walks, runs and steps on the spot.
 
-    Forwards, backwards and sideways; what follows from the ground comes by itself.
+    Every joint swings at the same pace. Forwards, backwards and sideways; contact with the ground is not planned for,
+    it results from the simulation.
     """
     rows = rows_of(body)
     pace, phase = random.uniform(0.6, 2.6, (count, 1)), random.uniform(0.0, 2.0 * np.pi, (count, 1))
@@ -98,7 +102,10 @@ def gaits(random: np.random.Generator, body: Body, count: int, steps: int, dt: f
 
 
 def moves(random: np.random.Generator, body: Body, count: int, steps: int, dt: float) -> np.ndarray:
-    """From one pose to the next (N, steps, J, 3), as deep in the knees as may be: steps aside, squats, recoveries."""
+    """Return joint targets (N, steps, J, 3) [rad] of moves from pose to pose, with knees bent to random depths.
+
+    They cover steps aside, squats and recoveries.
+    """
     rows, knots = rows_of(body), 4
     pause = random.uniform(0.1, 0.5, (count, 1))
     poses = 1.5 * random.uniform(0.0, 1.0, (count, 1, 1, 1)) * spreads(body)
@@ -116,7 +123,7 @@ def moves(random: np.random.Generator, body: Body, count: int, steps: int, dt: f
 
 
 def spreads(body: Body) -> np.ndarray:
-    """How far the angles of a style differ from kick to kick, standard deviation (J, 3) [rad]."""
+    """Return the standard deviation (J, 3) [rad] by which angles differ from motion to motion."""
     lower, upper = limits(body)
     usual = [STRAY[segment_of(body.links[child].name)] for child, _, _ in body.motors]
     return np.minimum(1.5 * np.array(usual)[:, None], 0.2 * (upper - lower))

@@ -1,4 +1,4 @@
-"""Tracking: the servo-driven human follows a wanted motion in the truth, under joint targets that a planner finds.
+"""Tracking of a wanted motion by the servo-driven human in the ground truth, with planned joint targets.
 
     minimise over theta   mean_t sum_i w_i |x_i(t) - x_i^wanted(t)|^2    links are where they are wanted
     subject to            S_{t+1} = truth(S_t, Q_t),  Q = Q^wanted + spline(theta)
@@ -22,14 +22,17 @@ HORIZON = 30
 KNOTS = 7
 EVERY = 4
 OPTIMIZER = CEM(samples=64, rounds=2, elites=12)
-# The planner's own truth: engine steps in a control step, enough to stand on, and simulations side by side.
+# The planner's own ground truth: engine steps per control step, enough to stand on, and parallel simulations.
 SUBSTEPS, ROWS = 4, 32
 # Standard deviation of the joint targets tried, as a share of the motors' range.
 SPREAD = 0.1
 
 
 class Tracker:
-    """Follows the positions of wanted states (T, L, 13), weighted (T, L), from joint targets (T, J, 3) [rad] on."""
+    """Planner that tracks positions of wanted states (T, L, 13) with weights (T, L).
+
+    controls: joint targets (T, J, 3) [rad] that the search begins from.
+    """
 
     def __init__(self, scene: Scene, wanted: np.ndarray, weights: np.ndarray, controls: np.ndarray) -> None:
         self.scene, self.controls = scene, controls
@@ -47,7 +50,7 @@ class Tracker:
         )  # fmt: skip
 
     def follow(self, state: np.ndarray, begin: int, end: int) -> tuple[np.ndarray, np.ndarray]:
-        """From `state` (L, 13) at step `begin` to step `end`, in the truth.
+        """Track the wanted motion in the ground truth, from `state` (L, 13) at step `begin` to step `end`.
 
         Returns the states (end - begin + 1, L, 13), `state` first, and the joint targets (end - begin, J, 3) [rad].
         """
