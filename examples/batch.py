@@ -14,16 +14,17 @@ from rich.progress import track
 from larp_model.files import written_whole
 from tasks.data import random_task
 from tasks.kick import Kick
+from tasks.session import Session
 
 Row = tuple[np.ndarray, np.ndarray, np.ndarray, float, bool]
 
 
-def kicks(kick: Kick, numbers: np.ndarray, seed: int) -> list[Row]:
+def kicks(session: Session, numbers: np.ndarray, seed: int) -> list[Row]:
     """Return kicks to random targets, with the ball's place moved a little each time; compiled once."""
     rows = []
     for number in track(numbers.tolist(), "kicks"):
         target, offset = random_task(np.random.default_rng((seed, number)))
-        run = kick.to(target, preset="fast", seed=number, state=kick.start(offset))
+        run = session.run(target, "fast", number, session.task.start(offset))
         rows.append((target, run.states, run.joint_targets, run.truth_error_m, run.summary["fell"]))
     return rows
 
@@ -33,7 +34,7 @@ def main(count: int = 1000, path: str = "runs/kicks.npz", processes: int = 1, se
     shares = np.array_split(np.arange(count), processes)
     # Spawned, not forked: JAX has threads, which a fork would lack and wait for.
     with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
-        made = pool.map(kicks, [Kick.standard()] * processes, shares, [seed] * processes)
+        made = pool.map(kicks, [Session(Kick.standard())] * processes, shares, [seed] * processes)
         targets, states, controls, errors, fell = zip(*chain.from_iterable(made), strict=True)
     steps = min(map(len, states))  # longer kicks are cut to this length
     arrays = {

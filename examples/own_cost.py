@@ -12,6 +12,7 @@ from jax import Array
 from larp_model import state as packed
 from mpc import CostTerm, quadratic
 from tasks.kick import Kick
+from tasks.session import Session
 
 TARGET = (4.0, 0.5, 0.4)
 
@@ -23,19 +24,19 @@ class Gentle(Kick):
     speed = 10.0
 
     @property
-    def goals(self) -> tuple[CostTerm, ...]:
-        """Return the terms of a kick, and one for the ball's highest speed."""
+    def costs(self) -> tuple[CostTerm, ...]:
+        """Return a term for the ball's highest speed."""
 
         def pace(states: Array, controls: Array, context: Any) -> Array:
             speeds = jnp.linalg.norm(states[:, self.ball, packed.VELOCITY], axis=-1)
             return speeds.max(keepdims=True) - self.speed
 
-        return *super().goals, CostTerm("pace", pace, quadratic, weight=0.5)
+        return (CostTerm("pace", pace, quadratic, weight=0.5),)
 
 
 def main() -> None:
     """Kick to the same target with and without the cost."""
-    usual, gentle = (task.standard().to(TARGET, preset="fast") for task in (Kick, Gentle))
+    usual, gentle = (Session(task.standard()).run(TARGET, "fast") for task in (Kick, Gentle))
     for what, run in (("as it comes", usual), ("gently", gentle)):
         speed = run.summary["ball_speed_m_s"]
         print(f"{what}: {speed:.1f} m/s, missed by {100 * run.truth_error_m:.1f} cm")

@@ -11,6 +11,7 @@ import mujoco
 from larp_model.bodies import ball, kicking
 from larp_model.mjcf import humanoid
 from tasks.kick import Kick
+from tasks.session import Session
 
 SOURCE = Path(mujoco.__file__).parent / "mjx/test_data/humanoid/humanoid.xml"
 TARGET = (3.0, 0.3, 0.4)
@@ -19,7 +20,7 @@ TARGET = (3.0, 0.3, 0.4)
 def main() -> None:
     """Kick with this humanoid as with our human."""
     kick = Kick.of(kicking(humanoid(SOURCE), ball()))
-    run = kick.to(TARGET, preset="fast")
+    run = Session(kick).run(TARGET, "fast")
     print(f"missed by {100 * run.truth_error_m:.1f} cm at {run.summary['ball_speed_m_s']:.1f} m/s")
     assert run.truth_error_m < 0.25
 

@@ -15,6 +15,7 @@ from larp_model import state as packed
 from mpc import Dynamics
 from tasks.kick import Kick
 from tasks.models import models_of
+from tasks.session import Session
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ def main() -> None:
     kick = Kick.standard()
     ours = models_of(kick.scene, "larp").whole
     knowing = InWind(ours, kick.ball, kick.scene.links[kick.ball].radius + 0.01, kick.scene.dt)
-    blind, aware = (kick.to(TARGET, "fast", model, world=Windy(kick)) for model in ("larp", knowing))
+    blind, aware = (Session(kick, model).run(TARGET, "fast", world=Windy(kick)) for model in ("larp", knowing))
     print(f"missed by {100 * blind.truth_error_m:.1f} cm without, {100 * aware.truth_error_m:.1f} cm with the wind")
     assert aware.truth_error_m < 0.5 * blind.truth_error_m
 

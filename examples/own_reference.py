@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
 from tasks.kick import Kick
+from tasks.session import Session
 
 TARGET = (4.0, 0.4, 0.4)
 
@@ -40,7 +41,7 @@ def main(file: str | None = None) -> None:
     if file is None:
         path.parent.mkdir(exist_ok=True)
         leaning(path)
-    run = Kick.standard(path).to(TARGET, preset="fast")
+    run = Session(Kick.standard(path)).run(TARGET, "fast")
     print(f"{path}: missed by {100 * run.truth_error_m:.1f} cm, {run.summary['reference_deviation_m']:.3f} m off it")
     assert run.truth_error_m < 0.5 and not run.summary["fell"]
 

@@ -11,6 +11,7 @@ import numpy as np
 from larp_model import Simulator
 from larp_model import state as packed
 from tasks.kick import Kick
+from tasks.session import Session
 
 TARGET = (4.0, 0.0, 0.5)
 # Acceleration of a flying ball [m/s^2]: wind from the right at some 8 m/s.
@@ -41,7 +42,7 @@ class Windy:
 def main() -> None:
     """Kick with a planner that ignores the wind, and miss to the left: see `own_model.py`."""
     kick = Kick.standard()
-    run = kick.to(TARGET, preset="fast", world=Windy(kick))
+    run = Session(kick).run(TARGET, "fast", world=Windy(kick))
     aside = run.states[:, kick.ball, 1].max()
     print(f"blown {aside:.2f} m to the left, missed by {100 * run.truth_error_m:.1f} cm")
     assert run.summary["touched"] and 0.05 < run.truth_error_m < 1.0

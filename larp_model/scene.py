@@ -174,6 +174,12 @@ class Body:
         return tuple((i, j, j.motor) for i, j in enumerate(self.joints, start=1) if j.motor is not None)
 
     @property
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return lower and upper bounds of the joint targets, both (J, 3) [rad]."""
+        bounds = np.array([(motor.lower, motor.upper) for _, _, motor in self.motors]).reshape(-1, 2, 3)
+        return bounds[:, 0], bounds[:, 1]
+
+    @property
     def sizes(self) -> np.ndarray:
         """Return length [m], radius [m] and mass [kg] of every link, (n, 3)."""
         return np.array([(link.length, link.radius, link.mass) for link in self.links])
@@ -308,6 +314,12 @@ class Scene:
     def motors(self) -> tuple[Motor, ...]:
         """Return all motors, in the order of the control."""
         return tuple(motor for body in self.bodies for _, _, motor in body.motors)
+
+    @property
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return lower and upper bounds of all joint targets, both (J, 3) [rad]."""
+        lower, upper = zip(*(body.limits for body in self.bodies), strict=True)
+        return np.concatenate(lower), np.concatenate(upper)
 
     def joints(self) -> Iterator[tuple[int, int, Joint]]:
         """Yield (row of the child, row of the parent, joint) for every joint."""

@@ -3,13 +3,13 @@
 from mpc.cem import CEM
 from mpc.cost import CostTerm, absolute, evaluate, l2, nearest_on_path, quadratic
 from mpc.dynamics import Continued, Dynamics, MujocoDynamics
+from mpc.fallback import Fallback
 from mpc.gauss_newton import GaussNewton
 from mpc.gradient import Gradient
 from mpc.mppi import MPPI
-from mpc.planner import Plan, PlanInfo, Planner
+from mpc.planner import Plan, PlanInfo, Planner, Window
 from mpc.search import Optimizer
 from mpc.spline import interpolate, shift
-from mpc.unless import Unless
 from mpc.verified import Verified
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "Continued",
     "CostTerm",
     "Dynamics",
+    "Fallback",
     "GaussNewton",
     "Gradient",
     "MujocoDynamics",
@@ -25,8 +26,8 @@ __all__ = [
     "Plan",
     "PlanInfo",
     "Planner",
-    "Unless",
     "Verified",
+    "Window",
     "absolute",
     "evaluate",
     "interpolate",

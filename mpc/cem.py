@@ -20,6 +20,7 @@ class CEM:
     """
 
     differentiates: ClassVar[bool] = False
+    terminal: ClassVar[bool] = False
 
     samples: int = 256
     """Candidates of the first round."""
@@ -64,7 +65,7 @@ class CEM:
         """Return the search after all rounds."""
         for index, size in enumerate(self.sizes):
             candidates = self.sample(search, random, size, last=index == self.rounds - 1)
-            search = self.update(search, candidates, problem.tries(candidates).costs)
+            search = self.update(search, candidates, problem.evaluate(candidates).costs)
         return search
 
     def sample(self, search: Search, random: np.random.Generator, size: int, last: bool) -> np.ndarray:

@@ -2,12 +2,12 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
 from larp_model.errors import InputError
-from mpc.search import COLOUR, Problem, Residuals, Search, Tried, coloured_noise, merged
+from mpc.search import COLOUR, Evaluations, Problem, Residuals, Search, coloured_noise, merged
 
 # Dampings of a round, tried side by side, as multiples of the last one that served best; it is expected to do so again.
 FACTORS = np.array([1e-2, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0, 1000.0])
@@ -23,9 +23,9 @@ class Linearization(NamedTuple):
     """Residuals around knots, taken as linear along directions from them."""
 
     knots: np.ndarray  # (K, J, 3)
-    here: Tried  # what they came to, N = 1
+    here: Evaluations  # what they came to, N = 1
     directions: np.ndarray  # (D, K, J, 3)
-    there: Tried  # what their neighbours came to, N = D, or none where derivatives are not differences
+    there: Evaluations  # what their neighbours came to, N = D, or none where derivatives are not differences
 
 
 class Quadratic(NamedTuple):
@@ -53,6 +53,8 @@ class GaussNewton:
     from. J comes from forward derivatives of the rollout (`forward`), or from differences of `step` spreads, which any
     dynamics have and which see the same candidates' programs (`differences`): R rounds try R + 1 batches.
     """
+
+    terminal: ClassVar[bool] = False
 
     rounds: int = 3
     directions: int = 24
@@ -96,7 +98,7 @@ class GaussNewton:
         """
         directions = self.drawn(search, random)
         begun = np.concatenate([knots[None], self.neighbours(knots, directions)])
-        tried = problem.tries(begun)
+        tried = problem.evaluate(begun)
         search, here = merged(search, begun, tried.costs), tried.row(0)
         if not np.isfinite(here.costs[0]):
             return self.look_around(knots, search, random, problem)
@@ -111,7 +113,7 @@ class GaussNewton:
             ahead = knots if missed else knots + steps[EXPECTED]
             neighbours = self.neighbours(ahead, directions)[: 0 if number + 1 == self.rounds else None]
             together = np.concatenate([knots + steps, neighbours])
-            tried = problem.tries(together)
+            tried = problem.evaluate(together)
             search, best = merged(search, together, tried.costs), int(np.argmin(tried.costs[: len(steps)]))
             there, expected = tried.rows(slice(len(steps), None)), here if missed else tried.row(EXPECTED)
             gained = float(here.costs[0] - tried.costs[best])
@@ -133,7 +135,7 @@ class GaussNewton:
         """Refine the best candidate around knots whose own rollout is lost, so that nothing is linear there."""
         for left in reversed(range(self.rounds)):
             around = knots + self.drawn(search, random)
-            tried = problem.tries(around)
+            tried = problem.evaluate(around)
             search, best = merged(search, around, tried.costs), int(np.argmin(tried.costs))
             if np.isfinite(tried.costs[best]):
                 return replace(self, rounds=left).refine(around[best], search, random, problem) if left else search
@@ -183,7 +185,7 @@ class GaussNewton:
         return steps * share[:, None, None, None].astype(np.float32), coordinates * share[:, None], dampings
 
 
-def quadratic(here: Tried, derivatives: Residuals) -> Quadratic:
+def quadratic(here: Evaluations, derivatives: Residuals) -> Quadratic:
     """Return the quadratic around one candidate from its residuals (1, ...) and their derivatives (D, ...)."""
     slopes = [
         (_flat(derivatives[name]).astype(float), _flat(here.residuals[name])[0], _flat(here.curvatures[name])[0])

@@ -28,6 +28,7 @@ class Gradient:
     """
 
     differentiates: ClassVar[bool] = True
+    terminal: ClassVar[bool] = False
 
     steps: int = 4
     learning_rate: float = 0.05
@@ -53,7 +54,7 @@ class Gradient:
             if step < self.steps:
                 costs, gradient = problem.gradients(knots)
             else:
-                costs = problem.tries(knots).costs
+                costs = problem.evaluate(knots).costs
             won = costs < best_costs
             best = np.where(won[:, None, None, None], knots, best)
             best_costs = np.where(won, costs, best_costs)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import jax
 import numpy as np
 
-from mpc.planner import Plan, PlanInfo, Planner
+from mpc.planner import Plan, PlanInfo, Planner, Window
 
 
 class World(Protocol):
@@ -26,43 +26,32 @@ class DivergenceError(RuntimeError):
     """Raised where the world's state is no longer finite, and executing on would mean nothing."""
 
 
-class Window(NamedTuple):
-    """The task's input for the next H steps: reference controls (H, J, 3) [rad] and the residuals' context.
-
-    steps: so many of the H suffice; all by default. weights: of cost terms by name, instead of their own.
-    """
-
-    controls: np.ndarray
-    context: Any
-    steps: int | None = None
-    weights: Mapping[str, float] | None = None
-
-
 def never(step: int, state: np.ndarray) -> bool:
     """Return False: nothing ends the phase."""
     return False
 
 
 class Phase(NamedTuple):
-    """A part of an execution with its planners and windows.
+    """Part of an execution with its own planners.
 
-    first: the planner of its first plan; again: of all later ones, every `every` steps. Both share horizon and knots.
-    window: the window that begins in a step. over: whether the phase ends in a step with a state (L, 13); its plan is
-    carried on for `linger` steps, then the next phase begins or, after the last, planning ends. A phase whose first
-    planner is the one before's `again` goes on with its plan. links: those that the planners' dynamics know.
+    first: the planner of the first plan; replan: of all later ones, every `interval` steps. Both share horizon and
+    knots. window: returns the window that begins at a step. is_done: returns whether the phase ends at a step in a
+    state (L, 13); its plan is then executed for `hold_steps` more before the next phase begins. After the last phase
+    nothing is planned any more. A phase whose first planner is the `replan` of the phase before continues with its
+    plan. links: those that the planners' dynamics have.
     """
 
     first: Planner
-    again: Planner
-    every: int
+    replan: Planner
+    interval: int
     window: Callable[[int], Window]
-    over: Callable[[int, np.ndarray], bool] = never
-    linger: int = 0
+    is_done: Callable[[int, np.ndarray], bool] = never
+    hold_steps: int = 0
     links: slice = slice(None)
 
 
-class Replan(NamedTuple):
-    """One planning step: its step and phase, the state (L, 13) that it began from, the plan and its `PlanInfo`."""
+class PlanRecord(NamedTuple):
+    """A plan with its step and phase, the state (L, 13) that it began from, and its `PlanInfo`."""
 
     step: int
     phase: int
@@ -73,15 +62,15 @@ class Replan(NamedTuple):
 
 @dataclass
 class Execution:
-    """A record of an execution: states (T + 1, L, 13), joint targets (T, J, 3) [rad], and every plan on the way."""
+    """Record of an execution: states (T + 1, L, 13), joint targets (T, J, 3) [rad], and every plan on the way."""
 
     states: list[np.ndarray]
     controls: list[np.ndarray] = field(default_factory=list)
-    replans: list[Replan] = field(default_factory=list)
+    plans: list[PlanRecord] = field(default_factory=list)
 
 
-class Begun(NamedTuple):
-    """The part of an interrupted execution that is needed to go on with it.
+class Checkpoint(NamedTuple):
+    """Part of an interrupted execution that is needed to continue it.
 
     states (T + 1, L, 13) and controls (T, J, 3) [rad] so far; the last plan, the step and the phase it was made in.
     """
@@ -93,10 +82,10 @@ class Begun(NamedTuple):
     phase: int
 
     @staticmethod
-    def of(execution: Execution) -> Begun:
-        """Return the part of an execution so far."""
-        last = execution.replans[-1]
-        return Begun(np.stack(execution.states), np.stack(execution.controls), last.plan, last.step, last.phase)
+    def of(execution: Execution) -> Checkpoint:
+        """Return the checkpoint of an execution so far."""
+        last = execution.plans[-1]
+        return Checkpoint(np.stack(execution.states), np.stack(execution.controls), last.plan, last.step, last.phase)
 
 
 def execute(
@@ -105,49 +94,44 @@ def execute(
     phases: Sequence[Phase],
     steps: int,
     key: jax.Array,
-    dt: float,
     observe: Callable[[Execution], None] = lambda execution: None,
     sense: Callable[[np.ndarray], np.ndarray] = lambda state: state,
-    begun: Begun | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> Execution:
-    """Plan in the true state, from state (L, 13) on, execute and plan again, one phase after the other.
+    """Plan, execute and replan for `steps`, from a state (L, 13) on, one phase after the other.
 
-    After the last phase its plan is carried out, and after the plan's end the task's reference. `observe` is called
-    after every step. sense: what the planners are shown of a true state (L, 13); all of it by default. begun: to go
-    on with, from the state it has reached; the plans found are then those from there on. Raises
-    `DivergenceError` as soon as the world diverges.
+    After the last phase its plan is executed and, after the plan's end, the task's reference. observe: called after
+    every step. sense: returns the state that the planners are given of a true state (L, 13); the same by default.
+    checkpoint: to continue from; the plans in the result are then those from there on. Raises `DivergenceError` as soon
+    as the world diverges.
     """
     execution = Execution([np.asarray(state)])
     index, plan, planned_at, targets = 0, None, 0, np.zeros(0)
     ends: int | None = None
-    if begun is not None:
-        execution = Execution([*begun.states], [*begun.controls])
-        plan, planned_at, index = begun.plan, begun.step, begun.phase
-        targets = np.asarray(phases[index].again.controls(plan, phases[index].window(planned_at).controls))
+    if checkpoint is not None:
+        execution = Execution([*checkpoint.states], [*checkpoint.controls])
+        plan, planned_at, index = checkpoint.plan, checkpoint.step, checkpoint.phase
+        targets = np.asarray(phases[index].replan.controls(plan, phases[index].window(planned_at).reference))
     world.reset(execution.states[-1][None])
     for step in range(len(execution.controls), steps):
         current = sense(execution.states[-1])
         while index < len(phases):
-            if ends is None and phases[index].over(step, current):
-                ends = step + phases[index].linger
+            if ends is None and phases[index].is_done(step, current):
+                ends = step + phases[index].hold_steps
             if ends is None or step < ends:
                 break
-            if phases[index + 1 :] and phases[index + 1].first is not phases[index].again:
+            if phases[index + 1 :] and phases[index + 1].first is not phases[index].replan:
                 plan = None
             index, ends = index + 1, None
         phase = phases[min(index, len(phases) - 1)]
-        if index < len(phases) and (plan is None or (ends is None and step - planned_at >= phase.every)):
-            planner = phase.first if plan is None else phase.again
-            before = planner.init(jax.random.fold_in(key, index), step * dt) if plan is None else plan
-            wanted = phase.window(step)
-            seen = current[phase.links]
-            plan, info = planner.step(
-                before, seen, wanted.controls, wanted.context, wanted.weights, now=step * dt, steps=wanted.steps
-            )
-            targets, planned_at = np.asarray(planner.controls(plan, wanted.controls)), step
-            execution.replans.append(Replan(step, index, current, plan, info))
+        if index < len(phases) and (plan is None or (ends is None and step - planned_at >= phase.interval)):
+            planner, window = phase.first if plan is None else phase.replan, phase.window(step)
+            warm_start = planner.init(jax.random.fold_in(key, index), window.time) if plan is None else plan
+            plan, info = planner.step(warm_start, current[phase.links], window)
+            targets, planned_at = np.asarray(planner.controls(plan, window.reference)), step
+            execution.plans.append(PlanRecord(step, index, current, plan, info))
         ahead = step - planned_at
-        control = targets[ahead] if ahead < len(targets) else phase.window(step).controls[0]
+        control = targets[ahead] if ahead < len(targets) else np.asarray(phase.window(step).reference)[0]
         execution.controls.append(control)
         after = world.step(control[None])[0]
         if not np.isfinite(after).all():

@@ -18,6 +18,7 @@ class MPPI:
     """
 
     differentiates: ClassVar[bool] = False
+    terminal: ClassVar[bool] = False
 
     samples: int = 64
     """Candidates of a round."""
@@ -42,10 +43,10 @@ class MPPI:
             noise = coloured_noise(random, (self.samples, *search.mean.shape), self.exponent)
             candidates = search.mean + search.spread * noise
             candidates[0] = search.mean
-            costs = problem.tries(candidates).costs
+            costs = problem.evaluate(candidates).costs
             search = self.update(merged(search, candidates, costs), candidates, costs)
         last = search.mean[None]
-        return merged(search, last, problem.tries(last).costs)
+        return merged(search, last, problem.evaluate(last).costs)
 
     def update(self, search: Search, candidates: np.ndarray, costs: np.ndarray) -> Search:
         """Return the search with its mean at the weighted average; where no candidate is finite it stays."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -15,9 +16,24 @@ from larp_model.errors import InputError
 from larp_model.runtime import remember_compilations
 from mpc.cost import CostTerm, require_weight
 from mpc.dynamics import Dynamics
-from mpc.problem import Equations, PlannerProblem, Programs, Wanted
+from mpc.problem import Equations, Inputs, PlannerProblem, Programs
 from mpc.search import COLOUR, Optimizer, Search, coloured_noise
 from mpc.spline import Interpolation, shift
+
+
+class Window(NamedTuple):
+    """The H steps ahead that a plan is made for, as a task describes them.
+
+    time: at which they begin [s]. reference: (H, J, 3) [rad], joint targets that the search starts from. context: any
+    pytree of arrays, for the residuals. steps: the dynamics compute only so many of the H; all by default. weights: of
+    cost terms by name, instead of their own.
+    """
+
+    time: float
+    reference: np.ndarray | jax.Array
+    context: Any = None
+    steps: int | None = None
+    weights: Mapping[str, float] | None = None
 
 
 class Plan(NamedTuple):
@@ -104,21 +120,11 @@ class Planner:
         self._equations = Equations(
             dynamics, self.terms, self.knot_times, self.control_times, interpolation, self.lower, self.upper
         )
-        self._controls = jax.jit(self._equations.controls)
         self._use(optimizers)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return all but compiled programs: copies, and other processes, compile their own."""
-        return {name: value for name, value in self.__dict__.items() if name != "_controls"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._controls = jax.jit(self._equations.controls)
 
     def using(self, optimizers: Optimizer | Sequence[Optimizer]) -> Planner:
         """Return a planner of the same problem with other optimisers, which shares compiled programs."""
-        other = object.__new__(Planner)
-        other.__dict__.update(self.__dict__)
+        other = copy.copy(self)
         other._use(optimizers)
         return other
 
@@ -133,7 +139,7 @@ class Planner:
                 names = type(each).__name__, type(self.dynamics).__name__
                 raise InputError("optimizers: got {}, needs differentiable dynamics, not {}".format(*names))
         for each in self.optimizers[:-1]:
-            if getattr(each, "settles", False):
+            if each.terminal:
                 raise InputError(f"optimizers: got {type(each).__name__} before another, needs it last")
         self.elites = max(optimizer.elites for optimizer in self.optimizers)
 
@@ -145,35 +151,25 @@ class Planner:
         elites[0] = 0.0
         return Plan(elites, spread, np.float32(now), _entropy(random))
 
-    def step(
-        self,
-        plan: Plan,
-        state: ArrayLike,
-        reference: ArrayLike,
-        context: Any = None,
-        weights: Mapping[str, float] | None = None,
-        now: float = 0.0,
-        steps: int | None = None,
-    ) -> tuple[Plan, PlanInfo]:
-        """Plan the window that starts `now` [s] in `state` (L, 13), warm-started by the last plan.
+    def step(self, plan: Plan, state: ArrayLike, window: Window) -> tuple[Plan, PlanInfo]:
+        """Plan a window that begins in `state` (L, 13), warm-started by the last plan.
 
-        `reference` (H, J, 3) [rad] are the controls to start from in this window; `context` any pytree of
-        arrays that the residuals take; `weights` replace those of the terms they name. `steps` of the H suffice,
-        if given: the dynamics compute no more of them under control. The plan never costs more, in the
-        dynamics' eyes, than the last plan carried on. If no candidate is finite, that one returns at cost inf.
+        By the dynamics, the plan never costs more than the last plan shifted to the window's time. If no candidate is
+        finite, that one is returned, at cost inf.
         """
-        wanted = self._wanted(plan, state, reference, context, weights, now, steps)
+        inputs = self._inputs(plan, state, window)
         begin, compiled = time.perf_counter(), self._programs.seconds
         random = np.random.default_rng(plan.key)
-        search = self._shifted(plan, now - float(plan.start), random)
-        problem = PlannerProblem(self._equations, self._programs, wanted, search.elites[0])
+        search = self._shifted(plan, window.time - float(plan.start), random)
+        problem = PlannerProblem(self._equations, self._programs, inputs, search.elites[0])
         for optimizer in self.optimizers:
             search = optimizer.improve(search, random, problem)
             if len(search.elites) != self.elites:
                 name = type(optimizer).__name__
                 raise InputError(f"optimizers: got {len(search.elites)} elites from {name}, needs {self.elites}")
         known = np.isfinite(search.costs)[:, None, None, None]
-        after = Plan(np.where(known, search.elites, search.elites[0]), search.spread, np.float32(now), _entropy(random))
+        elites = np.where(known, search.elites, search.elites[0])
+        after = Plan(elites, search.spread, np.float32(window.time), _entropy(random))
         states = problem.states_of(after.knots)
         cost, terms = problem.judged(after.knots)
         compile_seconds = self._programs.seconds - compiled
@@ -181,7 +177,7 @@ class Planner:
         return after, PlanInfo(
             cost=cost,
             terms=terms,
-            states=np.delete(states, np.s_[self.horizon if steps is None else steps : self.horizon], axis=0),
+            states=np.delete(states, np.s_[window.steps or self.horizon : self.horizon], axis=0),
             costs=record.costs,
             elite_costs=search.costs,
             finite=sum(int(np.isfinite(each).sum()) for each in record.costs),
@@ -191,41 +187,24 @@ class Planner:
             compile_seconds=compile_seconds,
         )
 
-    def compile(
-        self,
-        state: ArrayLike,
-        reference: ArrayLike,
-        context: Any = None,
-        weights: Mapping[str, float] | None = None,
-        steps: int | None = None,
-    ) -> float:
+    def compile(self, state: ArrayLike, window: Window) -> float:
         """Compile the programs of a first plan with arguments of these shapes, by making it; return the seconds."""
-        _, info = self.step(self.init(jax.random.key(0)), state, reference, context, weights, 0.0, steps)
+        _, info = self.step(self.init(jax.random.key(0), window.time), state, window)
         return info.compile_seconds
 
-    def fan(
-        self,
-        plan: Plan,
-        state: ArrayLike,
-        reference: ArrayLike,
-        context: Any = None,
-        weights: Mapping[str, float] | None = None,
-        steps: int | None = None,
-        count: int = 16,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return costs (N,) and states (N, H', L, 13) of candidates around a plan made in `state`, for looking.
+    def fan(self, plan: Plan, state: ArrayLike, window: Window, count: int = 16) -> tuple[np.ndarray, np.ndarray]:
+        """Return costs (N,) and states (N, H', L, 13) of candidates around a plan made in `state`, for display.
 
-        Candidates are drawn with half the plan's spread, the same ones each time. For the other arguments see `step`,
-        whose programs serve here too.
+        Candidates are drawn with half the plan's spread, the same ones each time, and rolled out by programs of `step`.
         """
         noise = coloured_noise(np.random.default_rng(0), (count, *plan.knots.shape), COLOUR)
-        wanted = self._wanted(plan, state, reference, context, weights, float(plan.start), steps)
-        problem = PlannerProblem(self._equations, self._programs, wanted, plan.knots)
+        inputs = self._inputs(plan, state, window)
+        problem = PlannerProblem(self._equations, self._programs, inputs, plan.knots)
         return problem.shown(plan.knots + 0.5 * plan.spread * noise)
 
     def controls(self, plan: Plan, reference: ArrayLike) -> jax.Array:
         """Return joint targets (H, J, 3) [rad] of the plan, given the reference (H, J, 3) it was made around."""
-        return self._controls(plan.knots, self._reference(reference))
+        return _controls(self._equations, plan.knots, self._reference(reference))
 
     def _shift(self, elites: jax.Array, spread: jax.Array, elapsed: jax.Array) -> tuple[jax.Array, jax.Array]:
         times = jnp.asarray(self.knot_times)
@@ -246,16 +225,7 @@ class Planner:
         spread = spread + self.reheat * np.maximum(self.scale - spread, 0.0)
         return Search(elites[0], spread, elites, np.full(self.elites, np.inf, np.float32), self.scale)
 
-    def _wanted(
-        self,
-        plan: Plan,
-        state: ArrayLike,
-        reference: ArrayLike,
-        context: Any,
-        weights: Mapping[str, float] | None,
-        now: float,
-        steps: int | None,
-    ) -> Wanted:
+    def _inputs(self, plan: Plan, state: ArrayLike, window: Window) -> Inputs:
         """Return the public arguments, checked, as arrays of fixed shape and type."""
         state = np.asarray(state, np.float32)
         if state.ndim != 2 or state.shape[1] != 13:
@@ -266,17 +236,18 @@ class Planner:
         if plan.knots.shape != knots:
             raise InputError(f"plan: got knots {plan.knots.shape}, needs {knots}; it is another problem's")
         start = float(plan.start)  # of a clock in 32 bits, hence the tolerance
-        if not start - 1e-4 * max(1.0, abs(start)) <= now < np.inf:
-            raise InputError(f"now: got {now} s, needs a time from plan.start, {start} s, on")
-        if steps is not None and not 1 <= steps <= self.horizon:
-            raise InputError(f"steps: got {steps}, needs 1 to horizon ({self.horizon})")
-        current = {term.name: float(term.weight) for term in self.terms}
-        for name, weight in (weights or {}).items():
-            if name not in current:
-                raise InputError(f"weights: got {name!r}, needs names of cost terms: {', '.join(current)}")
+        if not start - 1e-4 * max(1.0, abs(start)) <= window.time < np.inf:
+            raise InputError(f"window.time: got {window.time} s, needs a time from plan.start, {start} s, on")
+        if window.steps is not None and not 1 <= window.steps <= self.horizon:
+            raise InputError(f"window.steps: got {window.steps}, needs 1 to horizon ({self.horizon})")
+        weights = {term.name: float(term.weight) for term in self.terms}
+        for name, weight in (window.weights or {}).items():
+            if name not in weights:
+                raise InputError(f"window.weights: got {name!r}, needs names of cost terms: {', '.join(weights)}")
             require_weight(name, weight)
-            current[name] = float(weight)
-        return Wanted(state, self._reference(reference), *jax.tree.map(_array, (context, current, steps)))
+            weights[name] = float(weight)
+        rest = jax.tree.map(_array, (window.context, weights, window.steps))
+        return Inputs(state, self._reference(window.reference), *rest)
 
     def _reference(self, reference: ArrayLike) -> ArrayLike:
         shape = (self.horizon, *self.scale.shape)
@@ -297,6 +268,9 @@ class Planner:
         names = [term.name for term in self.terms]
         if not names or len(set(names)) < len(names):
             raise InputError(f"terms: got {names}, needs at least one, each with its own name")
+
+
+_controls = jax.jit(Equations.controls, static_argnums=0)
 
 
 def _entropy(random: np.random.Generator) -> np.ndarray:

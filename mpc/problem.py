@@ -14,7 +14,7 @@ import numpy as np
 
 from mpc.cost import CostTerm, curvatures, evaluate, residuals, weighed
 from mpc.dynamics import Dynamics, side_by_side
-from mpc.search import Residuals, Tried
+from mpc.search import Evaluations, Residuals
 from mpc.spline import Interpolation, interpolate
 
 # Every size is compiled apart, a kick's for 8 s and more. So on a CPU candidates are rolled out
@@ -22,7 +22,7 @@ from mpc.spline import Interpolation, interpolate
 FEW = 32
 
 
-class Wanted(NamedTuple):
+class Inputs(NamedTuple):
     """Inputs of one plan: NumPy arrays, and JAX arrays inside compiled programs."""
 
     state: Any  # (L, 13), where it starts
@@ -52,50 +52,50 @@ class Equations:
         times = jnp.asarray(self.knot_times), jnp.asarray(self.control_times)
         return jnp.clip(reference + interpolate(knots, *times, self.interpolation), self.lower, self.upper)
 
-    def roll_out(self, dynamics: Dynamics, wanted: Wanted, knots: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def roll_out(self, dynamics: Dynamics, inputs: Inputs, knots: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return states (N, H', L, 13) and controls (N, H, J, 3) of knots (N, K, J, 3)."""
-        controls = jax.vmap(self.controls, (0, None))(knots, wanted.reference)
-        start = jnp.broadcast_to(wanted.state, (len(knots), *wanted.state.shape))
-        return dynamics.rollout(start, controls, **({} if wanted.steps is None else {"steps": wanted.steps})), controls
+        controls = jax.vmap(self.controls, (0, None))(knots, inputs.reference)
+        start = jnp.broadcast_to(inputs.state, (len(knots), *inputs.state.shape))
+        return dynamics.rollout(start, controls, **({} if inputs.steps is None else {"steps": inputs.steps})), controls
 
     def weigh(
-        self, wanted: Wanted, states: jax.Array, controls: jax.Array, corrections: Any
+        self, inputs: Inputs, states: jax.Array, controls: jax.Array, corrections: Any
     ) -> tuple[jax.Array, Any, Any]:
         """Return costs, residuals plus corrections, and their curvatures, of N candidates."""
 
         def one(states: jax.Array, controls: jax.Array) -> tuple[jax.Array, Any, Any]:
-            found = residuals(self.terms, states, controls, wanted.context, corrections)
-            cost, _ = weighed(self.terms, found, states, wanted.weights)
-            return cost, found, curvatures(self.terms, found, wanted.weights)
+            found = residuals(self.terms, states, controls, inputs.context, corrections)
+            cost, _ = weighed(self.terms, found, states, inputs.weights)
+            return cost, found, curvatures(self.terms, found, inputs.weights)
 
         return jax.vmap(one)(states, controls)
 
     def gradients(
-        self, dynamics: Dynamics, wanted: Wanted, knots: jax.Array, corrections: Any
+        self, dynamics: Dynamics, inputs: Inputs, knots: jax.Array, corrections: Any
     ) -> tuple[jax.Array, Any, jax.Array]:
         """Return gradients (N, K, J, 3) of the costs of knots (N, K, J, 3), the result of `weigh`, and the states."""
 
         def summed(knots: jax.Array) -> tuple[jax.Array, Any]:
-            states, controls = self.roll_out(dynamics, wanted, knots)
-            tried = self.weigh(wanted, states, controls, corrections)
+            states, controls = self.roll_out(dynamics, inputs, knots)
+            tried = self.weigh(inputs, states, controls, corrections)
             return jnp.sum(tried[0]), (tried, states)
 
         gradient, (tried, states) = jax.grad(summed, has_aux=True)(knots)
         return gradient, tried, states
 
-    def tangents(self, dynamics: Dynamics, wanted: Wanted, knots: jax.Array, directions: jax.Array) -> Any:
+    def tangents(self, dynamics: Dynamics, inputs: Inputs, knots: jax.Array, directions: jax.Array) -> Any:
         """Return derivatives (D, ...) of the residuals at knots (K, J, 3) along directions (D, K, J, 3)."""
 
         def found(knots: jax.Array) -> Any:
-            states, controls = (leaf[0] for leaf in self.roll_out(dynamics, wanted, knots[None]))
-            return residuals(self.terms, states, controls, wanted.context)
+            states, controls = (leaf[0] for leaf in self.roll_out(dynamics, inputs, knots[None]))
+            return residuals(self.terms, states, controls, inputs.context)
 
         return jax.vmap(lambda direction: jax.jvp(found, (knots,), (direction,))[1])(directions)
 
-    def judge(self, wanted: Wanted, knots: jax.Array, states: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def judge(self, inputs: Inputs, knots: jax.Array, states: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Return the cost and each term's share of knots (K, J, 3) that led to states (H', L, 13)."""
-        controls = self.controls(knots, wanted.reference)
-        return evaluate(self.terms, states, controls, wanted.context, wanted.weights)
+        controls = self.controls(knots, inputs.reference)
+        return evaluate(self.terms, states, controls, inputs.context, inputs.weights)
 
 
 class Programs:
@@ -104,10 +104,19 @@ class Programs:
     def __init__(self) -> None:
         self.seconds = 0.0
         self._compiled: dict[Any, Any] = {}
+        self._dynamics: list[Dynamics] = []
 
     def __getstate__(self) -> dict[str, Any]:
         """Return no compiled programs, which cannot be copied."""
-        return self.__dict__ | {"_compiled": {}}
+        return self.__dict__ | {"_compiled": {}, "_dynamics": []}
+
+    def number(self, dynamics: Dynamics) -> int:
+        """Return the number of these dynamics among all that were asked for; they need not be hashable."""
+        for number, other in enumerate(self._dynamics):
+            if other is dynamics:
+                return number
+        self._dynamics.append(dynamics)
+        return len(self._dynamics) - 1
 
     def __call__(self, name: Any, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return the function's finished result, compiled first where needed; `name` stands for the function."""
@@ -115,10 +124,9 @@ class Programs:
         signature = name, structure, tuple((np.shape(leaf), leaf.dtype) for leaf in leaves)
         if signature not in self._compiled:
             begin = time.perf_counter()
-            # The function is kept, too: as long as it is, what its name stands for is.
-            self._compiled[signature] = jax.jit(function).lower(*arguments).compile(), function
+            self._compiled[signature] = jax.jit(function).lower(*arguments).compile()
             self.seconds += time.perf_counter() - begin
-        return jax.block_until_ready(self._compiled[signature][0](*arguments))
+        return jax.block_until_ready(self._compiled[signature](*arguments))
 
 
 @dataclass
@@ -136,32 +144,32 @@ class PlannerProblem:
 
     equations: Equations
     run: Programs
-    wanted: Wanted
-    carried: np.ndarray
+    inputs: Inputs
+    warm_start: np.ndarray
     corrections: Residuals = field(default_factory=dict)
     record: Record = field(default_factory=Record)
-    known: dict[bytes, Tried] = field(default_factory=dict)
+    known: dict[bytes, Evaluations] = field(default_factory=dict)
     """Results of the best candidate of each batch, by its knots."""
 
-    def tries(self, knots: np.ndarray) -> Tried:
+    def evaluate(self, knots: np.ndarray) -> Evaluations:
         """See `search.Problem`."""
         if len(knots) == 1 and (known := self.known.get(knots.tobytes())):
             return known
         dynamics = self.equations.dynamics
         size = side_by_side(dynamics)
         few = len(knots) <= (max(FEW, size) if jax.default_backend() == "cpu" else size)
-        return self._tries(dynamics, knots, size if few else len(knots))
+        return self._evaluate(dynamics, knots, size if few else len(knots))
 
     def gradients(self, knots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """See `search.Problem`."""
         function, arguments = called(self.equations.gradients, self.equations.dynamics)
-        gradient, tried, states = self.run("gradients", function, *arguments, self.wanted, knots, self.corrections)
+        gradient, tried, states = self.run("gradients", function, *arguments, self.inputs, knots, self.corrections)
         return self._recorded(knots, tried, states).costs, np.asarray(gradient)
 
     def tangents(self, knots: np.ndarray, directions: np.ndarray) -> Residuals:
         """See `search.Problem`."""
         function, arguments = called(self.equations.tangents, self.equations.dynamics)
-        found = self.run("tangents", function, *arguments, self.wanted, knots, directions)
+        found = self.run("tangents", function, *arguments, self.inputs, knots, directions)
         return {name: np.asarray(each) for name, each in found.items()}
 
     def lost(self, count: int) -> None:
@@ -169,11 +177,11 @@ class PlannerProblem:
         if count:
             self.record.costs.append(np.full(count, np.inf, np.float32))
 
-    def trials(self, dynamics: Dynamics, knots: np.ndarray) -> Tried:
+    def validate(self, dynamics: Dynamics, knots: np.ndarray) -> Evaluations:
         """See `search.Problem`."""
         self.record.verified += len(knots)
         apart = replace(self, corrections={}, record=Record(self.record.costs), known={})
-        return apart._tries(dynamics, knots, len(knots))
+        return apart._evaluate(dynamics, knots, len(knots))
 
     def corrected(self, corrections: Residuals) -> PlannerProblem:
         """See `search.Problem`."""
@@ -182,7 +190,7 @@ class PlannerProblem:
     def states_of(self, knots: np.ndarray) -> np.ndarray:
         """Return the states (H', L, 13) of knots (K, J, 3)."""
         if knots.tobytes() not in self.record.best:
-            self.tries(knots[None])
+            self.evaluate(knots[None])
         return self.record.best[knots.tobytes()]
 
     def shown(self, knots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -193,27 +201,27 @@ class PlannerProblem:
 
     def judged(self, knots: np.ndarray) -> tuple[float, dict[str, float]]:
         """Return the cost of knots (K, J, 3) and each term's share of it."""
-        cost, terms = self.run("judge", self.equations.judge, self.wanted, knots, self.states_of(knots))
+        cost, terms = self.run("judge", self.equations.judge, self.inputs, knots, self.states_of(knots))
         return float(cost), {name: float(value) for name, value in terms.items()}
 
-    def _tries(self, dynamics: Dynamics, knots: np.ndarray, size: int) -> Tried:
+    def _evaluate(self, dynamics: Dynamics, knots: np.ndarray, size: int) -> Evaluations:
         return self._recorded(knots, *self._rolled(dynamics, knots, size))
 
     def _rolled(self, dynamics: Dynamics, knots: np.ndarray, size: int) -> tuple[Any, Any]:
         """Return the result of `weigh` for knots, and their states: `size` at a time, the last ones filled up."""
-        name, found = ("roll out", id(dynamics)), []
+        name, found = ("roll out", self.run.number(dynamics)), []
         roll_out, arguments = called(self.equations.roll_out, dynamics)
         for begin in range(0, len(knots), size):
             rows = np.minimum(np.arange(begin, begin + size), len(knots) - 1)
-            states, controls = self.run(name, roll_out, *arguments, self.wanted, knots[rows])
-            tried = self.run("weigh", self.equations.weigh, self.wanted, states, controls, self.corrections)
+            states, controls = self.run(name, roll_out, *arguments, self.inputs, knots[rows])
+            tried = self.run("weigh", self.equations.weigh, self.inputs, states, controls, self.corrections)
             found.append((tried, states))
         if len(knots) == size:
             return found[0]
         return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(knots)], *found)
 
-    def _recorded(self, knots: np.ndarray, tried: Any, states: jax.Array) -> Tried:
-        found = Tried(*jax.tree.map(np.asarray, tried))
+    def _recorded(self, knots: np.ndarray, tried: Any, states: jax.Array) -> Evaluations:
+        found = Evaluations(*jax.tree.map(np.asarray, tried))
         self.record.costs.append(found.costs)
         best = int(np.argmin(found.costs))
         key = knots[best].tobytes()

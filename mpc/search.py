@@ -31,23 +31,23 @@ Residuals = dict[str, np.ndarray]
 """By term, (N, R) or (N, T, R), of N candidates."""
 
 
-Enough = tuple[tuple[str, float], ...]
-"""Residuals by name, and the length that each of them may have where a candidate is good enough."""
+Tolerance = tuple[tuple[str, float], ...]
+"""Residuals by name, with the length that each may have where a search has converged."""
 
 
-class Tried(NamedTuple):
+class Evaluations(NamedTuple):
     """Results of N candidates."""
 
     costs: np.ndarray  # (N,), +inf where a candidate is not finite
     residuals: Residuals
     curvatures: Residuals  # c of each residual r: near the candidate its cost is a constant + sum(c r^2) / 2
 
-    def rows(self, which: slice) -> Tried:
+    def rows(self, which: slice) -> Evaluations:
         """Return some of the candidates."""
         residuals, curvatures = ({name: each[which] for name, each in values.items()} for values in self[1:])
-        return Tried(self.costs[which], residuals, curvatures)
+        return Evaluations(self.costs[which], residuals, curvatures)
 
-    def row(self, index: int) -> Tried:
+    def row(self, index: int) -> Evaluations:
         """Return one of the candidates alone, N = 1."""
         return self.rows(slice(index, index + 1))
 
@@ -55,7 +55,7 @@ class Tried(NamedTuple):
 class Problem(Protocol):
     """The problem as an optimiser sees it. The planner counts every cost that is computed."""
 
-    def tries(self, knots: np.ndarray) -> Tried:
+    def evaluate(self, knots: np.ndarray) -> Evaluations:
         """Return the results of knots (N, K, J, 3) [rad], rolled out in the planner's own dynamics."""
 
     def gradients(self, knots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -68,11 +68,11 @@ class Problem(Protocol):
         """Count candidates that could not be tried, because a gradient was not finite."""
 
     @property
-    def carried(self) -> np.ndarray:
+    def warm_start(self) -> np.ndarray:
         """Return knots (K, J, 3) [rad] of the last plan, shifted to now."""
 
-    def trials(self, dynamics: Any, knots: np.ndarray) -> Tried:
-        """Return `tries` in other dynamics, without corrections; counted apart."""
+    def validate(self, dynamics: Any, knots: np.ndarray) -> Evaluations:
+        """Return `evaluate` in other dynamics, without corrections; counted apart."""
 
     def corrected(self, corrections: Residuals) -> Problem:
         """Return the problem with something added to the residuals of every candidate, (1, ...) by term."""
@@ -80,10 +80,11 @@ class Problem(Protocol):
 
 @runtime_checkable
 class Optimizer(Protocol):
-    """An optimiser: the candidates that it returns are no worse than those it gets. Its fields are its settings.
+    """An optimiser: the candidates that it returns are no worse than those it gets. Its fields are its settings."""
 
-    One that ranks by other dynamics than the planner's own says so (`settles = True`), and comes last.
-    """
+    @property
+    def terminal(self) -> bool:
+        """Return whether it must be the last, because it ranks by other dynamics than the planner's own."""
 
     @property
     def differentiates(self) -> bool:
@@ -97,19 +98,19 @@ class Optimizer(Protocol):
         """Return the search after all rounds, with as many elites as before, ranked by what they cost."""
 
 
-def require_enough(enough: Enough) -> None:
+def require_tolerance(tolerance: Tolerance) -> None:
     """Raise InputError for lengths that are negative or not finite."""
-    for name, length in enough:
+    for name, length in tolerance:
         if not 0.0 <= length < np.inf:
-            raise InputError(f"enough: got {length} for {name!r}, needs a finite number >= 0")
+            raise InputError(f"tolerance: got {length} for {name!r}, needs a finite number >= 0")
 
 
-def suffices(enough: Enough, cost: float, residuals: Residuals) -> bool:
-    """Return whether one candidate, of this cost and residuals (1, ...), is good enough."""
-    for name, _ in enough:
+def converged(tolerance: Tolerance, cost: float, residuals: Residuals) -> bool:
+    """Return whether one candidate, of this cost and residuals (1, ...), is within the tolerance."""
+    for name, _ in tolerance:
         if name not in residuals:
-            raise InputError(f"enough: got {name!r}, needs names of cost terms: {', '.join(residuals)}")
-    short = [np.linalg.norm(residuals[name]) <= length for name, length in enough]
+            raise InputError(f"tolerance: got {name!r}, needs names of cost terms: {', '.join(residuals)}")
+    short = [np.linalg.norm(residuals[name]) <= length for name, length in tolerance]
     return bool(short) and bool(np.isfinite(cost)) and all(short)
 
 

@@ -195,9 +195,7 @@ def random_episodes(
     rows = np.minimum(begin[:, None] + np.arange(steps), len(reference.controls) - 1)
     size = random.uniform(0.0, 1.2, (count, 1, 1, 1))
     controls = reference.controls[rows] + size * smooth_noise(random, count, steps, 8, stray(scene))
-    lower = np.array([motor.lower for motor in scene.motors])
-    upper = np.array([motor.upper for motor in scene.motors])
-    controls = np.clip(controls, lower, upper)
+    controls = np.clip(controls, *scene.limits)
     torques = pushes(random, scene, count, steps)
     episodes, diverged = record(Truth(scene, batch=min(count, 256)), states, controls, torques, sizes)
     return episodes, tangled + diverged

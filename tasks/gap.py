@@ -15,35 +15,23 @@ from larp_model import state as packed
 from larp_model.detection import contact_points
 from larp_model.physics.kinematics import morphology_of
 from larp_model.scene import Scene
+from tasks.strike import strike_step
 
-# The ball has been struck when it is faster than this [m/s]; its launch is read so many steps later.
-STRUCK, LAUNCH_STEPS = 0.3, 8
+# The ball's launch is read so many steps after the strike.
+LAUNCH_STEPS = 8
 # It flies when it is higher above the ground than this, and has landed when it is lower than that [m].
 FLYING, LANDED = 0.02, 0.005
 
 
-def contact_step(states: np.ndarray, untouched: np.ndarray | None = None) -> int | None:
-    """Return the first row of states (T, L, 13) in which the last link, the ball, has been struck; None if it never is.
-
-    untouched: the velocities (T', 3) [m/s] that it would have if nothing touched it; at rest by default.
-    """
-    velocity = states[:, -1, packed.VELOCITY]
-    if untouched is not None:
-        rows = np.minimum(np.arange(len(velocity)), len(untouched) - 1)
-        velocity = velocity - untouched[rows]
-    struck = np.linalg.norm(velocity, axis=-1) > STRUCK
-    return int(struck.argmax()) if struck.any() else None
-
-
-def events(scene: Scene, states: np.ndarray, untouched: np.ndarray | None = None) -> dict[str, Any]:
+def events(scene: Scene, states: np.ndarray, free: np.ndarray) -> dict[str, Any]:
     """Return the ball's contact, launch and landing in states (T, L, 13); None for each that does not happen.
 
     contact_s: when the ball has been struck, to a step. contact_link: by which link. contact_point_m: where, from the
     ball's centre (3,). launch_m_s: its velocity (3,) `LAUNCH_STEPS` later. landing_m: where it first comes down (2,).
-    untouched: see `contact_step`.
+    free: (T, 13), states of the untouched ball, see `strike`.
     """
     none = dict.fromkeys(("contact_s", "contact_link", "contact_point_m", "launch_m_s", "landing_m"))
-    contact = contact_step(states, untouched)
+    contact = strike_step(states, free)
     if not contact:
         return none
     ball = states[:, -1]
@@ -62,17 +50,16 @@ def events(scene: Scene, states: np.ndarray, untouched: np.ndarray | None = None
     }
 
 
-def gap(
-    scene: Scene, truth: np.ndarray, model: np.ndarray, start: int, untouched: np.ndarray | None = None
-) -> dict[str, Any]:
+def gap(scene: Scene, truth: np.ndarray, model: np.ndarray, start: int, free: np.ndarray) -> dict[str, Any]:
     """Return every event in the ground truth and in the model, and how far apart the two are.
 
     truth: states (T, L, 13). model: predicted states (T', L, 13), the first of them the truth's in row `start`.
+    free: (T, 13), states of the untouched ball.
     launch_error: |v - v'| / |v|; launch_angle_deg: between the two; links_m, joints_deg: mean distance of the human's
     links and mean angle between its joints, at the true contact.
     """
-    true = events(scene, truth, untouched)
-    expected = events(scene, model, None if untouched is None else untouched[start:])
+    true = events(scene, truth, free)
+    expected = events(scene, model, free[start:])
     if expected["contact_s"] is not None:
         expected["contact_s"] += start * scene.dt
     result: dict[str, Any] = {name: {"truth": true[name], "model": expected[name]} for name in true}
@@ -83,7 +70,7 @@ def gap(
         cosine = a @ b / max(speed * np.linalg.norm(b), 1e-9)
         result["launch_error"] = float(np.linalg.norm(a - b) / speed)
         result["launch_angle_deg"] = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-    contact = contact_step(truth, untouched)
+    contact = strike_step(truth, free)
     if contact is not None and 0 <= contact - start < len(model):
         human = scene.rows(scene.bodies[0].name)
         a, b = truth[contact, human], model[contact - start, human]
@@ -93,22 +80,22 @@ def gap(
     return result
 
 
-def told(found: dict[str, Any]) -> dict[str, str]:
+def described(gap: dict[str, Any]) -> dict[str, str]:
     """Return the gap as labelled lines of a few words, for display."""
     lines = {}
-    if (contact := found["contact_s"])["truth"] is not None:
+    if (contact := gap["contact_s"])["truth"] is not None:
         lines["contact"] = (
             "{truth:.2f} s (model {model:.2f} s)".format(**contact) if contact["model"] else "not expected"
         )
-    if found["launch_error"] is not None:
-        speeds = {side: float(np.linalg.norm(velocity)) for side, velocity in found["launch_m_s"].items()}
-        apart = f"{found['launch_angle_deg']:.1f}\N{DEGREE SIGN} apart"
+    if gap["launch_error"] is not None:
+        speeds = {side: float(np.linalg.norm(velocity)) for side, velocity in gap["launch_m_s"].items()}
+        apart = f"{gap['launch_angle_deg']:.1f}\N{DEGREE SIGN} apart"
         lines["launch"] = "{truth:.1f} m/s (model {model:.1f} m/s, ".format(**speeds) + apart + ")"
-    if all(found["landing_m"].values()):
-        ways = {side: float(np.hypot(*place)) for side, place in found["landing_m"].items()}
+    if all(gap["landing_m"].values()):
+        ways = {side: float(np.hypot(*place)) for side, place in gap["landing_m"].items()}
         lines["lands at"] = "{truth:.1f} m (model {model:.1f} m)".format(**ways)
-    if found["links_m"] is not None:
-        lines["body at contact"] = f"{1000.0 * found['links_m']:.1f} mm, {found['joints_deg']:.1f}\N{DEGREE SIGN} off"
+    if gap["links_m"] is not None:
+        lines["body at contact"] = f"{1000.0 * gap['links_m']:.1f} mm, {gap['joints_deg']:.1f}\N{DEGREE SIGN} off"
     return lines
 
 

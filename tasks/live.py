@@ -20,10 +20,13 @@ from larp_model import state as packed
 from larp_model.engines.mujoco import Truth
 from larp_model.errors import InputError
 from larp_model.scene import Scene
-from mpc.loop import DivergenceError, Execution, Replan, Window
-from tasks.models import NO_WEIGHTS, DynamicsName, Models
+from mpc import Window
+from mpc.loop import DivergenceError, Execution, PlanRecord
+from tasks.models import NO_WEIGHTS, DynamicsName
 from tasks.presets import Preset
-from tasks.task import REACHABLE, Planners, Run, Task
+from tasks.run import REACHABLE, Run, facts, plans_of
+from tasks.session import Planners, Session
+from tasks.task import Task
 from viewer import (
     LivePage,
     Offer,
@@ -32,7 +35,6 @@ from viewer import (
     Recording,
     Wishes,
     kick_picture,
-    nearest_approach,
     page_of,
     write_film,
 )
@@ -101,17 +103,16 @@ class Live:
         target: np.ndarray,
         folder: Path,
         seed: int = 0,
-        start: Callable[[Task, Wishes], np.ndarray] = lambda task, wishes: task.start(),
         finished: Callable[[Run], None] = lambda run: None,
     ) -> None:
         """Begin the page with the first task, and list the kicks that are saved in the folder.
 
-        target: (3,) [m], at first. folder: where kicks are saved. start: returns the state (L, 13) to begin in for the
-        page's settings. finished: called with the first run.
+        target: (3,) [m], at first. folder: where kicks are saved. finished: called with the first run.
         """
         self.page, self.choices, self.folder, self.seed = page, choices, folder, seed
-        self._start, self._finished = start, finished
+        self._finished = finished
         self._tasks: dict[str, Task] = {}
+        self._sessions: dict[tuple[str, str, str], Session] = {}
         self._fitted: dict[tuple[str, str, str, str, float], Planners] = {}
         self.errors: deque[tuple[float, float]] = deque(maxlen=REMEMBERED)
         self.run: Run | None = None
@@ -134,17 +135,20 @@ class Live:
         """Return the planners for the page's settings; they are made once."""
         key = self._key(wishes)
         if key not in self._fitted:
-            task, preset = self.task(wishes.reference), self.choices.presets[wishes.preset]
-            models = self.models(wishes)
+            session, preset = self.session(wishes), self.choices.presets[wishes.preset]
             if wishes.budget:
-                preset = task.within(preset, wishes.budget, models, wishes.target)
-            self._fitted[key] = task.planners_of(preset, models)
+                preset = session.within(preset, wishes.budget, wishes.target)
+            self._fitted[key] = session.planners(preset)
         return self._fitted[key]
 
-    def models(self, wishes: Wishes) -> Models:
-        """Return the models for the page's settings."""
-        dynamics = next(each for each in self.choices.dynamics if each == wishes.dynamics)
-        return self.task(wishes.reference).models(dynamics, self.choices.weights[wishes.weights])
+    def session(self, wishes: Wishes) -> Session:
+        """Return the session for the page's reference, dynamics and weights; it is made once."""
+        key = wishes.reference, wishes.dynamics, wishes.weights
+        if key not in self._sessions:
+            dynamics = next(name for name in self.choices.dynamics if name == wishes.dynamics)
+            weights = self.choices.weights[wishes.weights]
+            self._sessions[key] = Session(self.task(wishes.reference), dynamics, weights)
+        return self._sessions[key]
 
     @staticmethod
     def _key(wishes: Wishes) -> tuple[str, str, str, str, float]:
@@ -172,21 +176,19 @@ class Live:
         wishes = self.page.wishes
         if (task := self._ready(wishes)) is None:
             return
-        planner, wanted, state = self.planners(wishes).first, self._window(task)(0), self._start(task, wishes)
-        told = wanted.controls, wanted.context, wanted.weights
-        plan, info = planner.step(planner.init(jax.random.key(self.seed)), state, *told, steps=wanted.steps)
-        costs, states = planner.fan(plan, state, *told, steps=wanted.steps)
+        planner, window, state = self.planners(wishes).first, self._window(task)(0), start(task, wishes)
+        plan, info = planner.step(planner.init(jax.random.key(self.seed)), state, window)
+        costs, states = planner.fan(plan, state, window)
         self.planned_for, self.plans = wishes, self.plans + 1
         if not np.isfinite(info.cost):
             self.page.tell("**No plan**: whatever was tried, the model does not know how it ends.")
             return
         fan = states[:, :, task.ball, packed.POSITION], costs
         self.page.planned(state, info.states, fan, task.reference.states[0])
-        path, place = info.states[:, task.ball, packed.POSITION], task.place(task.asked(wishes.target))
-        expected = nearest_approach(path, place).distance
+        expected = task.missed(info.states, 1, task.check(wishes.target))
         reach = "" if expected <= REACHABLE else " **Out of reach:** this plan comes nearest."
         said = f"The model expects to miss by {100.0 * expected:.1f} cm, planned in {info.seconds:.2f} s."
-        controls = np.asarray(planner.controls(plan, wanted.controls))
+        controls = np.asarray(planner.controls(plan, window.reference))
         self.page.tell(f"**Ready.** {said}{reach}\n\n{self._familiar(wishes, state, info.states, controls)}")
 
     def carry_out(self) -> None:
@@ -195,7 +197,7 @@ class Live:
         if (task := self._ready(wishes)) is None:
             return
         world, begun = Pushed(task.scene, task.substeps), time.monotonic()
-        planners, told = self.planners(wishes), list[Replan]()
+        planners, told = self.planners(wishes), list[PlanRecord]()
         goals = [wishes.target]
 
         def window(step: int) -> Window:
@@ -205,7 +207,7 @@ class Live:
         def observe(execution: Execution) -> None:
             nonlocal begun
             step = len(execution.states) - 1
-            last = task.plans(execution)[-1]
+            last = plans_of(execution)[-1]
             news = last.info.states if last.step == step - 1 else None
             reference = task.reference.states
             self.page.update(execution.states[-1], news, step * task.scene.dt, reference[min(step, len(reference) - 1)])
@@ -222,18 +224,17 @@ class Live:
                     raise InterruptedKickError(ask)
 
         try:
-            execution = task.run(
+            execution = self.session(wishes).execute(
                 planners,
                 wishes.target,
                 self.seed,
-                self._start(task, wishes),
+                start(task, wishes),
                 observe=observe,
                 world=world,
                 window=window,
             )
-            goal = task.asked(goals[-1])
-            said = {name: getattr(wishes, name) for name in ("preset", "dynamics", "weights")} | {"seed": self.seed}
-            self.run = Run(task, execution, goal, task.report(execution, goal) | said)
+            labels = {name: getattr(wishes, name) for name in ("preset", "dynamics", "weights")}
+            self.run = Run.of(task, execution, task.check(goals[-1]), **labels, seed=self.seed)
             self.recording = self.run.recording
         except InterruptedKickError as ended:
             if str(ended) == "kick":
@@ -265,7 +266,7 @@ class Live:
 
     def _familiar(self, wishes: Wishes, state: np.ndarray, expected: np.ndarray, controls: np.ndarray) -> str:
         """Return a sentence on the plan's novelty to the learned model; empty where nothing is learned."""
-        found = self.models(wishes).novelty(np.concatenate([state[None], expected[: len(controls)]]), controls)
+        found = self.session(wishes).models.novelty(np.concatenate([state[None], expected[: len(controls)]]), controls)
         if found is None:
             return ""
         known = "as in its training" if found <= NOVEL else "**unlike its training: trust it less**"
@@ -300,11 +301,11 @@ class Live:
             return False
         return True
 
-    def _told(self, plans: list[Replan], wishes: Wishes, dt: float) -> None:
+    def _told(self, plans: list[PlanRecord], wishes: Wishes, dt: float) -> None:
         """Show figures of the running kick, and of those before, on the page."""
         if not plans:
             return
-        infos, every = [plan.info for plan in plans], self.planners(wishes).every
+        infos, every = [plan.info for plan in plans], self.planners(wishes).interval
         again = 1e3 * np.array([info.seconds for info in infos][1:] or [infos[0].seconds])
         lost = sum(info.candidates - info.finite for info in infos)
         lines = [
@@ -351,6 +352,11 @@ class Live:
         self.page.panel.kept(list(self.kept))
 
 
+def start(task: Task, wishes: Wishes) -> np.ndarray:
+    """Return the state (L, 13) in which a kick begins, with the ball's place and velocity set on the page."""
+    return task.start(np.array(wishes.spot), np.array(wishes.roll))
+
+
 def due(last: float, step: float) -> float:
     """Return when the next step is due, by `time.monotonic` [s].
 
@@ -369,16 +375,16 @@ def opened(task: Task, folder: Path) -> Recording:
         summary = json.loads((folder / "summary.json").read_text())
         with np.load(folder / f"{task.name}.npz", allow_pickle=False) as file:
             states, predicted, begun = (file[name] for name in ("states", "predicted_states", "plan_step"))
-        goal, facts, before = task.asked(tuple(summary["target"])), task.facts(summary), states[int(begun)][None]
+        goal, lines, before = task.check(tuple(summary["target"])), facts(task, summary), states[int(begun)][None]
     except Exception as error:  # json, numpy and zipfile raise many kinds for a damaged file
         raise InputError(f"{folder.name} cannot be read: {type(error).__name__}: {error}") from None
     return Recording(
         task.scene,
         states,
-        task.place(goal),
+        task.marker(goal),
         np.concatenate([before, predicted]),
         int(begun),
         task.reference.states[: len(states)],
         f"{task.title(goal)} ({folder.name})",
-        facts,
+        lines,
     )

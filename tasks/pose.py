@@ -27,7 +27,7 @@ from larp_model.files import require_writable, write_whole
 from larp_model.scene import Body, Scene
 from larp_model.simulator import Simulator
 from mpc import Dynamics, MujocoDynamics
-from mpc.loop import Begun, Execution
+from mpc.loop import Checkpoint, Execution
 from tasks.command import Teller, prepare_jax, run
 from tasks.keypoints import camera as cameras
 from tasks.keypoints import figure as figures
@@ -136,11 +136,11 @@ def reconstruct(
 
     def observe(execution: Execution) -> None:
         nonlocal spent, counted, saved
-        for replan in execution.replans[counted:]:
-            spent = spent.and_by(replan.info)
-        counted = len(execution.replans)
+        for plan in execution.plans[counted:]:
+            spent = spent.and_by(plan.info)
+        counted = len(execution.plans)
         if kept is not None and counted and time.monotonic() - saved > OFTEN:
-            kept.keep(lifted, Begun.of(execution), spent)
+            kept.keep(lifted, Checkpoint.of(execution), spent)
             saved = time.monotonic()
         at(len(execution.controls), len(wanted.states) - 1)
 

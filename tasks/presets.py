@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 from larp_model.errors import InputError
 from larp_model.names import require_known
-from mpc import CEM, MPPI, Dynamics, GaussNewton, Gradient, Optimizer, Unless
+from mpc import CEM, MPPI, Dynamics, Fallback, GaussNewton, Gradient, Optimizer
 
 # Time of a replan, as a share of the first plan's, where a budget is given.
 AGAIN = 0.2
@@ -20,8 +20,11 @@ STEPS = GaussNewton(rounds=2, directions=24)
 # A first plan that misses its target by more, in the model, has failed to converge [m]; so has a replan, which has less
 # time.
 ASTRAY, LATE = (("target", 0.1),), (("target", 0.05),)
-REPLAN = GaussNewton(rounds=1), Unless(LATE, (GaussNewton(rounds=4),))
+REPLAN = GaussNewton(rounds=1), Fallback(LATE, (GaussNewton(rounds=4),))
 STAND = CEM(samples=64, rounds=2, elites=12, decay=1.0)
+
+# Fields of a preset that have another name than they had.
+RENAMED = {"again": "replan", "every": "interval", "enough": "tolerance", "stand": "recovery"}
 
 Stage = tuple[Optimizer, ...]
 
@@ -30,30 +33,30 @@ Stage = tuple[Optimizer, ...]
 class Preset:
     """Trade of time for accuracy: optimisers of the first plan and of each replan, and steps between replans.
 
-    verify: rounds of trials in the ground truth of the first plan and of each replan, at most; 0 for none. correct: the
-    optimiser that searches on between two rounds. candidates: tried in a round. enough: a miss, in the ground truth,
-    that ends the trials [m]. stand: optimisers of the plans that keep the human up after the kick.
+    verify: rounds of validation in the ground truth of the first plan and of each replan, at most; 0 for none. correct:
+    the optimiser that searches on between two rounds. candidates: validated in a round. tolerance: a miss in the ground
+    truth that ends the rounds [m]. recovery: optimisers of the plans that keep the human up after the kick.
     """
 
     first: Stage
-    again: Stage
-    every: int
+    replan: Stage
+    interval: int
     verify: tuple[int, int] = (0, 0)
     correct: Optimizer = STEPS
     candidates: int = 1
-    enough: float = 0.004
-    stand: Stage = (STAND,)
+    tolerance: float = 0.004
+    recovery: Stage = (STAND,)
 
     def __post_init__(self) -> None:
-        for name in ("every", "candidates"):
+        for name in ("interval", "candidates"):
             if not (_whole(value := getattr(self, name)) and value >= 1):
                 raise InputError(f"{name} is {value!r}, but must be an integer of at least 1")
         pair = self.verify
         if not (isinstance(pair, tuple) and len(pair) == 2 and all(_whole(each) and each >= 0 for each in pair)):
             raise InputError(f"verify is {pair!r}, but must be two integers of at least 0, of first plan and replans")
-        if not (isinstance(self.enough, int | float) and 0.0 <= self.enough < math.inf):
-            raise InputError(f"enough is {self.enough!r}, but must be a finite number of at least 0 [m]")
-        for name in ("first", "again", "stand"):
+        if not (isinstance(self.tolerance, int | float) and 0.0 <= self.tolerance < math.inf):
+            raise InputError(f"tolerance is {self.tolerance!r}, but must be a finite number of at least 0 [m]")
+        for name in ("first", "replan", "recovery"):
             stage = getattr(self, name)
             if not (isinstance(stage, tuple) and stage):
                 raise InputError(f"{name} is {stage!r}, but must be a tuple of at least one optimiser")
@@ -80,22 +83,22 @@ def _whole(value: object) -> bool:
 def _found(rounds: int, *around: int) -> Stage:
     """Return the stage of a first plan: Gauss-Newton steps from the reference, then searches where they end far off.
 
-    rounds: of the steps. around: rounds of each search; the next search is run only where the one before was not
-    enough. A search samples candidates around the reference, as many as the simulator rolls out side by side, and steps
-    go on from the best of them. Its spread stays wide: convergence is left to the steps.
+    rounds: of the steps. around: rounds of each search; the next search is run only where the one before did not
+    converge. A search samples candidates around the reference, as many as the simulator rolls out side by side, and
+    steps go on from the best of them. Its spread stays wide: convergence is left to the steps.
     """
     steps = replace(STEPS, rounds=rounds)
     searches = (CEM(32, each, 8, decay=1.0, floor=0.2) for each in around)
-    return steps, *(Unless(ASTRAY, (search, steps)) for search in searches)
+    return steps, *(Fallback(ASTRAY, (search, steps)) for search in searches)
 
 
 # Points of `tasks.benchmarks.tradeoff`. Over its 16 kicks `balanced` did better with a little sampling in its replans,
 # over 64 others worse.
 PresetName = Literal["fast", "balanced", "accurate"]
 PRESETS: dict[str, Preset] = {
-    "fast": Preset(_found(4, 8), REPLAN, every=5, stand=(replace(STAND, rounds=1),)),
-    "balanced": Preset(_found(16, 16, 64), REPLAN, every=1),
-    "accurate": Preset(_found(16, 16, 64), REPLAN, every=5, verify=(8, 3)),
+    "fast": Preset(_found(4, 8), REPLAN, interval=5, recovery=(replace(STAND, rounds=1),)),
+    "balanced": Preset(_found(16, 16, 64), REPLAN, interval=1),
+    "accurate": Preset(_found(16, 16, 64), REPLAN, interval=5, verify=(8, 3)),
 }
 
 
@@ -111,7 +114,7 @@ def preset_of(name: str) -> Preset:
 
 
 def changed(preset: Preset, changes: Sequence[str]) -> Preset:
-    """Return the preset with changed fields, each as NAME=VALUE: "every=2", "again.0.rounds=3", "verify=(4, 2)"."""
+    """Return the preset with changed fields, each as NAME=VALUE: "interval=2", "replan.0.rounds=3", "verify=(4, 2)"."""
     for change in changes:
         path, _, value = change.partition("=")
         try:
@@ -132,6 +135,8 @@ def _changed(part: Any, path: Sequence[str], value: Any, change: str) -> Any:
     if isinstance(part, tuple):
         require_known(f"change is {change!r}: {name}", name, map(str, range(len(part))))
         return (*part[: int(name)], _changed(part[int(name)], rest, value, change), *part[int(name) + 1 :])
+    if isinstance(part, Preset) and name in RENAMED:
+        raise InputError(f"change is {change!r}, but {name} is called {RENAMED[name]} now")
     known = [field.name for field in fields(part)] if is_dataclass(part) else []
     require_known(f"change is {change!r}: {name}", name, known)
     return replace(part, **{name: _changed(getattr(part, name), rest, value, change)})
@@ -141,8 +146,8 @@ class Seconds(NamedTuple):
     """Times that plans take without compilation [s]: the first one, a replan, and one that keeps the human up."""
 
     first: float
-    again: float
-    stand: float
+    replan: float
+    recovery: float
 
 
 def within(preset: Preset, seconds: float, measure: Callable[[Preset], Seconds]) -> Preset:
@@ -153,25 +158,25 @@ def within(preset: Preset, seconds: float, measure: Callable[[Preset], Seconds])
     """
     if not (math.isfinite(seconds) and seconds > 0.0):
         raise InputError(f"budget is {seconds}, but must be a finite number of seconds > 0")
-    preset = replace(preset, first=_usual(preset.first), again=_usual(preset.again))
+    preset = replace(preset, first=_usual(preset.first), replan=_usual(preset.replan))
     fitting, factors = preset, Seconds(1.0, 1.0, 1.0)
     least = scaled(preset, Seconds(0.0, 0.0, 0.0))
     for _ in range(3):
         took = measure(fitting)
         if fitting == least and took.first > seconds:
             raise InputError(f"budget is {seconds:g} s, but the least that this preset needs is {took.first:.2g} s")
-        again = AGAIN * seconds
+        replan = AGAIN * seconds
         factors = Seconds(
             factors.first * seconds / took.first,
-            factors.again * again / took.again,
-            min(1.0, factors.stand * again / took.stand),
+            factors.replan * replan / took.replan,
+            min(1.0, factors.recovery * replan / took.recovery),
         )
         fitting = scaled(preset, factors)
     return fitting
 
 
 def _usual(stage: Stage) -> Stage:
-    return tuple(each for each in stage if not isinstance(each, Unless))
+    return tuple(each for each in stage if not isinstance(each, Fallback))
 
 
 def scaled(preset: Preset, factors: Seconds) -> Preset:
@@ -179,8 +184,8 @@ def scaled(preset: Preset, factors: Seconds) -> Preset:
     return replace(
         preset,
         first=tuple(fitted(each, factors.first) for each in preset.first),
-        again=tuple(fitted(each, factors.again) for each in preset.again),
-        stand=tuple(fitted(each, factors.stand) for each in preset.stand),
+        replan=tuple(fitted(each, factors.replan) for each in preset.replan),
+        recovery=tuple(fitted(each, factors.recovery) for each in preset.recovery),
     )
 
 

@@ -1,44 +1,51 @@
-"""Residuals of cost terms that tasks share."""
+"""Residuals of cost terms that tasks share, and the context that they are given."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
 from larp_model import state as packed
-from mpc import nearest_on_path
 
 
-def pose(states: Array, controls: Array, context: Any, human: slice = slice(None)) -> Array:
-    """Return how far the human's links, seen from the pelvis, are from the reference's (H, 3 n) [m].
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Context:
+    """Data of a task that residuals need beside the states (H', L, 13) and controls (H, J, 3) of a candidate."""
 
-    context: `reference` (H, n, 3) [m], and `counted` (H,), the share to which each step counts. human: rows of its n
-    links in states (H', L, 13).
+    goal: Any  # pytree of arrays, as `Task.check` returns it
+    times: Any  # (H',) of the states, from the start [s]
+    reference: Any  # (H, n, 3) links of the human in the reference motion, from its pelvis [m]
+    reference_share: Any  # (H,) by which the distance from the reference counts
+    pelvis_height: Any  # () least height of the pelvis [m]
+    controls: Any  # (H, J, 3) of the reference [rad]
+
+
+def pose(states: Array, controls: Array, context: Context, human: slice = slice(None)) -> Array:
+    """Return the root-aligned distances of the human's links from the reference's (H, 3 n) [m].
+
+    human: rows of its n links in states (H', L, 13).
     """
     links = packed.position(states[: len(controls), human])
-    apart = links - links[:, :1] - context["reference"]
-    return (apart * context["counted"][:, None, None]).reshape(len(controls), -1)
+    apart = links - links[:, :1] - context.reference
+    return (apart * context.reference_share[:, None, None]).reshape(len(controls), -1)
 
 
 def effort(states: Array, controls: Array, context: Any) -> Array:
-    """Return how far joint targets (H, J, 3) are from the reference's, the context's `controls`, (H, 3 J) [rad]."""
-    return (controls - context["controls"]).reshape(len(controls), -1)
+    """Return the differences of joint targets (H, J, 3) from the context's `controls`, (H, 3 J) [rad]."""
+    return (controls - context.controls).reshape(len(controls), -1)
 
 
 def apart(states: Array, controls: Array, context: Any, link: int, other: int) -> Array:
     """Return the vector (3,) [m] from link `other` to `link`, by rows, where they are nearest within the controls."""
-    found = states[: len(controls), link, packed.POSITION] - states[: len(controls), other, packed.POSITION]
-    return found[jnp.argmin(jnp.sum(found**2, axis=-1))]
-
-
-def miss(states: Array, controls: Array, context: Any, ball: int) -> Array:
-    """Return the vector (3,) [m] from the context's `goal` (3,) [m] to the nearest point of the path of row `ball`."""
-    nearest, _ = nearest_on_path(states[:, ball, packed.POSITION], context["goal"])
-    return nearest - context["goal"]
+    vectors = states[: len(controls), link, packed.POSITION] - states[: len(controls), other, packed.POSITION]
+    return vectors[jnp.argmin(jnp.sum(vectors**2, axis=-1))]
 
 
 def upright(states: Array, controls: Array, context: Any) -> Array:
-    """Return how far the pelvis, row 0, is below the context's `height` [m], (H, 1) [m]."""
-    return jnp.maximum(context["height"] - states[: len(controls), 0, 2:3], 0.0)
+    """Return the depth of the pelvis, row 0, below the context's `pelvis_height` [m], (H, 1) [m]."""
+    return jnp.maximum(context.pelvis_height - states[: len(controls), 0, 2:3], 0.0)

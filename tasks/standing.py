@@ -15,8 +15,10 @@ where the human stands, and how wide.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -25,8 +27,7 @@ from larp_model import rotation
 from larp_model import state as packed
 from larp_model.bodies import standing_height
 from larp_model.scene import Scene
-from mpc import CostTerm, Dynamics, Optimizer, Planner, quadratic
-from mpc.loop import Window
+from mpc import CostTerm, Dynamics, Optimizer, Planner, Window, quadratic
 from tasks import residuals
 from tasks.data import stray
 from tasks.motions.references import Reference
@@ -40,6 +41,16 @@ SEARCH = 0.5
 SWUNG, SETTLED, STANCE = 20, 50, 50
 # Joint targets that are not zero when one stands: links and angles about x and y [rad], of the left side.
 KNEES, ELBOWS = 0.5, 0.25
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class StandingContext:
+    """Data that the residuals need beside the states (H, n, 13) and controls (H, J, 3) of a candidate."""
+
+    balance_share: Any  # (H,) by which balance and the height of the feet count
+    pelvis_height: Any  # (H, 1) least height of the pelvis [m]
+    controls: Any  # (H, J, 3) of the reference, then of the stance [rad]
 
 
 class Standing:
@@ -64,16 +75,16 @@ class Standing:
         pace = jnp.sqrt(jnp.maximum(place[..., 2:], 0.1) / self.scene.gravity)
         return (place + pace * velocity)[..., :2] - jnp.mean(packed.position(states)[..., self.feet, :2], axis=-2)
 
-    def balance(self, states: Array, controls: Array, context: Any) -> Array:
-        """Return `capture_point` (H, 2) [m], weighted by the context's `settled` (H,)."""
-        return context["settled"][:, None] * self.capture_point(states)
+    def balance(self, states: Array, controls: Array, context: StandingContext) -> Array:
+        """Return `capture_point` (H, 2) [m], weighted by the context's `balance_share` (H,)."""
+        return context.balance_share[:, None] * self.capture_point(states)
 
-    def feet_above(self, states: Array, controls: Array, context: Any) -> Array:
-        """Return the heights of both feet above the ground (H, 2) [m], weighted by the context's `settled` (H,)."""
+    def feet_above(self, states: Array, controls: Array, context: StandingContext) -> Array:
+        """Return the heights of both feet above the ground (H, 2) [m], weighted by `balance_share` (H,)."""
         above = packed.position(states)[:, self.feet, 2] - self.lying
-        return context["settled"][:, None] * jnp.maximum(above, 0.0)
+        return context.balance_share[:, None] * jnp.maximum(above, 0.0)
 
-    def lean(self, states: Array, controls: Array, context: Any) -> Array:
+    def lean(self, states: Array, controls: Array, context: StandingContext) -> Array:
         """Return the horizontal parts of the upward axes of pelvis and torso (H, 4)."""
         up = rotation.matrix(packed.orientation(states[:, self.trunk]))[..., :2, 2]
         return up.reshape(len(states), -1)
@@ -95,16 +106,15 @@ class Standing:
         share = smooth((ahead - 0.5 * SWUNG) / (STANCE - 0.5 * SWUNG))[:, None, None]
         last = self.reference.window(self.reference.strike + SWUNG // 2, 1)[1]
         controls = (1.0 - share) * last + share * self.stance
-        context = {
-            "settled": np.clip((ahead - SWUNG) / (SETTLED - SWUNG), 0.0, 1.0),
-            "height": np.full((HORIZON, 1), 0.95 * self.height),
-            "controls": controls,
-        }
-        return Window(controls, context)
+        context = StandingContext(
+            balance_share=np.clip((ahead - SWUNG) / (SETTLED - SWUNG), 0.0, 1.0),
+            pelvis_height=np.full((HORIZON, 1), 0.95 * self.height),
+            controls=controls,
+        )
+        return Window(step * self.scene.dt, controls, context)
 
     def planner(self, dynamics: Dynamics, optimizers: tuple[Optimizer, ...]) -> Planner:
         """Return a planner of this task on dynamics of the human alone."""
-        bounds = np.array([(motor.lower, motor.upper) for motor in self.scene.motors])
         return Planner(
             dynamics,
             self.terms,
@@ -113,8 +123,7 @@ class Standing:
             self.scene.dt,
             SEARCH * stray(self.scene),
             usable(dynamics, optimizers),
-            bounds[:, 0],
-            bounds[:, 1],
+            *self.scene.limits,
         )
 
 

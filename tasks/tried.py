@@ -53,8 +53,8 @@ def tried_episodes(kick: Kick, kicks: int, each: int, seed: int, seconds: float 
     parts = []
     for index in range(kicks):
         target, shift = random_task(random)
-        plan, wanted = planner.init(jax.random.key(seed + index)), kick.window(target)(0)
-        planner.step(plan, kick.start(shift), wanted.controls, wanted.context)
+        plan, window = planner.init(jax.random.key(seed + index)), kick.window(target)(0)
+        planner.step(plan, kick.start(shift), window._replace(steps=None))
         states, controls, after = (np.concatenate(rows) for rows in zip(*watched.seen, strict=True))
         watched.seen.clear()
         rows = random.choice(len(states), min(each, len(states)), replace=False)

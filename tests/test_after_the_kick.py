@@ -13,14 +13,20 @@ from larp_model.physics import kinematics
 from mpc import evaluate
 from tasks import kick, sensing
 from tasks.data import random_roll
-from tasks.gap import contact_step, events, gap
+from tasks.gap import events, gap
 from tasks.motions.references import standing_on_ground
 from tasks.standing import HORIZON, SWUNG, Standing
+from tasks.strike import strike_step
 
 
 @pytest.fixture(scope="module")
 def task() -> kick.Kick:
     return kick.Kick.standard()
+
+
+def at_rest(task: kick.Kick, count: int) -> np.ndarray:
+    """States (count, 13) of the ball at rest where the reference begins."""
+    return np.repeat(task.reference.states[:1, task.ball], count, axis=0)
 
 
 def stood(task: kick.Kick, standing: Standing) -> jax.Array:
@@ -43,8 +49,8 @@ def test_standing_still_costs_next_to_nothing_and_what_leads_to_a_fall_costs(
 ) -> None:
     standing = Standing(task.scene, task.reference)
     window = standing.window(task.reference.strike + 60)
-    human, controls = stood(task, standing), jnp.asarray(window.controls)
-    np.testing.assert_allclose(window.controls, np.broadcast_to(standing.stance, window.controls.shape))
+    human, controls = stood(task, standing), jnp.asarray(window.reference)
+    np.testing.assert_allclose(window.reference, np.broadcast_to(standing.stance, window.reference.shape))
     total, _ = evaluate(standing.terms, human, controls, window.context)
     assert float(total) < 0.5
     worse = human.at[:, links, column].add(by)
@@ -53,7 +59,7 @@ def test_standing_still_costs_next_to_nothing_and_what_leads_to_a_fall_costs(
 
 def test_the_targets_go_from_the_kick_to_the_stance_without_a_jump(task: kick.Kick) -> None:
     standing = Standing(task.scene, task.reference)
-    controls = np.stack([standing.window(step).controls[0] for step in range(task.reference.strike, 200)])
+    controls = np.stack([standing.window(step).reference[0] for step in range(task.reference.strike, 200)])
     last = task.reference.window(task.reference.strike + SWUNG // 2, 1)[1]
     np.testing.assert_array_equal(controls[0], last[0])
     assert np.abs(np.diff(controls, axis=0)).max() < 0.1
@@ -74,7 +80,7 @@ def test_the_capture_point_at_rest_is_below_the_centre_of_mass_and_moves_ahead_w
 
 def test_a_kick_that_happens_as_predicted_has_no_gap(task: kick.Kick) -> None:
     states = task.reference.states[:160]
-    found = gap(task.scene, states, states[20:], 20)
+    found = gap(task.scene, states, states[20:], 20, at_rest(task, len(states)))
     assert found["launch_error"] == 0.0 and found["links_m"] == 0.0
     assert found["launch_angle_deg"] == pytest.approx(0.0, abs=0.01)
     assert found["joints_deg"] == pytest.approx(0.0, abs=1e-4)
@@ -90,15 +96,15 @@ def test_a_prediction_that_turns_the_ball_is_reported_with_its_angle(task: kick.
     turned = states[20:].copy()
     velocity = turned[:, task.ball, packed.VELOCITY]
     turned[:, task.ball, packed.VELOCITY] = Rotation.from_euler("z", 10.0, degrees=True).apply(1.1 * velocity)
-    found = gap(task.scene, states, turned, 20)
+    found = gap(task.scene, states, turned, 20, at_rest(task, len(states)))
     assert 5.0 < found["launch_angle_deg"] <= 10.0
     assert found["launch_error"] > 0.1
 
 
 def test_a_ball_that_nothing_touches_has_no_events(task: kick.Kick) -> None:
     states = np.repeat(task.reference.states[:1], 20, axis=0)
-    assert contact_step(states) is None
-    assert set(events(task.scene, states).values()) == {None}
+    assert strike_step(states, at_rest(task, 20)) is None
+    assert set(events(task.scene, states, at_rest(task, 20)).values()) == {None}
 
 
 def test_a_rolling_ball_is_where_it_would_rest_when_the_reference_strikes(task: kick.Kick) -> None:
@@ -110,7 +116,7 @@ def test_a_rolling_ball_is_where_it_would_rest_when_the_reference_strikes(task: 
         path = task.untouched(state, task.reference.strike)
         wanted = task.reference.ball_spot[:2] + np.array([0.01, -0.02])
         np.testing.assert_allclose(path[-1, :2], wanted, atol=0.005)
-        assert contact_step(path[:, None], path[:, packed.VELOCITY]) is None
+        assert strike_step(path[:, None], path) is None
 
 
 def test_sensing_keeps_joints_closed_and_has_the_noise_it_says(task: kick.Kick) -> None:

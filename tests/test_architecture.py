@@ -64,7 +64,7 @@ ORDER = [
     "mpc.gradient",
     "mpc.gauss_newton",
     "mpc.verified",
-    "mpc.unless",
+    "mpc.fallback",
     "mpc.problem",
     "mpc.planner",
     "mpc.loop",
@@ -117,11 +117,14 @@ ORDER = [
     "tasks.presets",
     "tasks.standing",
     "tasks.sensing",
+    "tasks.strike",
     "tasks.gap",
     "tasks.command",
     "tasks.curve",
     "tasks.models",
     "tasks.task",
+    "tasks.run",
+    "tasks.session",
     "tasks.live",
     "tasks.kick",
     "tasks.tried",
@@ -257,6 +260,13 @@ def test_importing_everything_prints_nothing() -> None:
         cwd=ROOT, check=True, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
     )  # fmt: skip
     assert said.stdout == ""
+
+
+def test_a_task_is_imported_without_what_draws_it() -> None:
+    program = "import sys, tasks.kick; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True, text=True, stdout=subprocess.PIPE)
+    loaded = {name.partition(".")[0] for name in done.stdout.split()}
+    assert "mujoco" in loaded and not loaded & {"viewer", "viser", "matplotlib", "PIL"}
 
 
 @pytest.mark.parametrize("path", FILES + TESTS, ids=module_name)

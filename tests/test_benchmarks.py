@@ -115,7 +115,7 @@ def test_the_kick_benchmark_keeps_its_rows_and_touches_no_results(
     monkeypatch.chdir(tmp_path)
     report.RESULTS.write_text("# Results\n")
     search = (CEM(samples=8, rounds=1, elites=2),)
-    monkeypatch.setitem(PRESETS, "fast", Preset(search, search, every=40, stand=search))
+    monkeypatch.setitem(PRESETS, "fast", Preset(search, search, interval=40, recovery=search))
     kick.main(targets=1, preset="fast", dynamics="mujoco", substeps=4)
     found = json.loads(Path("runs/benchmarks/kick_fast_mujoco_substeps_4.json").read_text())
     (row,) = found["rows"]

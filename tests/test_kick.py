@@ -21,9 +21,10 @@ from mpc import CEM
 from tasks import kick
 from tasks.command import Teller, run
 from tasks.data import random_task
-from tasks.models import models_of
 from tasks.motions import references
-from tasks.presets import PRESETS, Preset, preset_of
+from tasks.presets import PRESETS, Preset
+from tasks.run import replayed, summarize
+from tasks.session import Session
 
 PROTOCOL = {
     "target",
@@ -53,7 +54,7 @@ def task() -> kick.Kick:
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     search, less = (CEM(samples=32, rounds=2, elites=8),), (CEM(samples=16, rounds=1, elites=8),)
-    monkeypatch.setitem(PRESETS, "fast", Preset(search, less, every=20, stand=less))
+    monkeypatch.setitem(PRESETS, "fast", Preset(search, less, interval=20, recovery=less))
 
 
 def test_the_reference_strikes_at_a_kickers_speed_and_is_still_up_half_a_second_later(task: kick.Kick) -> None:
@@ -65,7 +66,7 @@ def test_the_reference_strikes_at_a_kickers_speed_and_is_still_up_half_a_second_
     toe = np.linalg.norm(foot[:, packed.VELOCITY] + np.cross(foot[:, packed.ANGULAR_VELOCITY], to_toe), axis=-1)
     assert 8.0 <= toe[strike] <= 16.0
     assert np.linalg.norm(states[strike + 8, task.ball, packed.VELOCITY]) >= 8.0
-    assert states[: strike + 51, 0, 2].min() > 0.75 * task.standing
+    assert states[: strike + 51, 0, 2].min() > 0.75 * task.standing_height
 
 
 def test_the_standing_height_is_that_of_the_closed_up_rest_pose() -> None:
@@ -79,10 +80,12 @@ def test_the_full_human_may_touch_the_ball_with_its_toes() -> None:
     assert {"left_toes", "right_toes"} < set(pair.first_links)
 
 
-def test_the_ball_distance_counts_the_way_between_steps() -> None:
-    path = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
-    assert kick.miss(path, np.array([1.0, 0.3, 0.0])) == pytest.approx(0.3, abs=1e-6)
-    assert kick.miss(path, np.array([3.0, 0.0, 0.0])) == pytest.approx(1.0, abs=1e-6)
+def test_the_ball_distance_counts_the_way_between_steps(task: kick.Kick) -> None:
+    states = np.zeros((2, 14, 13))
+    states[1, task.ball, 0] = 2.0
+    assert task.missed(states, 0, np.array([1.0, 0.3, 0.0])) == pytest.approx(0.3, abs=1e-6)
+    assert task.missed(states, 0, np.array([3.0, 0.0, 0.0])) == pytest.approx(1.0, abs=1e-6)
+    assert task.missed(states[:1], 0, np.array([3.0, 0.0, 0.0])) == pytest.approx(3.0, abs=1e-6)
 
 
 def test_tasks_are_drawn_within_the_protocols_bounds() -> None:
@@ -96,11 +99,11 @@ def test_tasks_are_drawn_within_the_protocols_bounds() -> None:
 
 
 def test_fast_hits_its_targets_and_stays_near_the_reference(task: kick.Kick) -> None:
-    models = models_of(task.scene, "larp")
-    planners, random, reports = task.planners_of(preset_of("fast"), models), np.random.default_rng(5), []
+    session, random, reports = Session(task), np.random.default_rng(5), []
     for seed in range(3):
         target, shift = random_task(random)
-        reports.append(task.report(task.run(planners, target, seed, task.start(shift), stands=False), target))
+        execution = session.execute(session.planners("fast"), target, seed, task.start(shift), recovers=False)
+        reports.append(summarize(task, execution, target))
     assert np.mean([report["truth_error_m"] for report in reports]) <= 0.08
     assert max(report["reference_deviation_m"] for report in reports) <= 0.05
     assert sum(report["compile_seconds"] for report in reports) > 0.0
@@ -108,24 +111,20 @@ def test_fast_hits_its_targets_and_stays_near_the_reference(task: kick.Kick) -> 
 
 
 def test_with_the_truth_as_model_what_is_predicted_happens(task: kick.Kick, small: None) -> None:
-    models = models_of(task.scene, "mujoco", substeps=task.substeps)
-    planners = task.planners_of(preset_of("fast"), models)
-    target = np.array([3.0, 0.2, 0.4])
-    execution = task.run(planners._replace(every=100), target, seed=0, stands=False)
-    report = task.report(execution, target)
+    session, target = Session(task, "mujoco", substeps=task.substeps), np.array([3.0, 0.2, 0.4])
+    execution = session.execute(session.planners("fast")._replace(interval=100), target, seed=0, recovers=False)
+    report = summarize(task, execution, target)
     assert report["touched"]
     assert report["truth_error_m"] == pytest.approx(report["model_error_m"], abs=0.01)
 
 
 def test_the_limit_is_the_miss_of_the_same_controls_at_the_finer_step(small: None) -> None:
     coarse = kick.Kick.standard(substeps=4)
-    models = models_of(coarse.scene, "mujoco", substeps=4)
-    target = np.array([3.0, 0.2, 0.4])
-    planners = coarse.planners_of(preset_of("fast"), models)
-    execution = coarse.run(planners, target, seed=0, stands=False)
-    report = coarse.report(execution, target)
-    assert coarse.replayed(execution, target, substeps=4) == pytest.approx(report["truth_error_m"], abs=1e-6)
-    assert report["limit_error_m"] == coarse.replayed(execution, target)
+    session, target = Session(coarse, "mujoco", substeps=4), np.array([3.0, 0.2, 0.4])
+    execution = session.execute(session.planners("fast"), target, seed=0, recovers=False)
+    report = summarize(coarse, execution, target)
+    assert replayed(coarse, execution, target, substeps=4) == pytest.approx(report["truth_error_m"], abs=1e-6)
+    assert report["limit_error_m"] == replayed(coarse, execution, target)
     assert abs(report["limit_error_m"] - report["truth_error_m"]) > 0.01
 
 
@@ -150,28 +149,28 @@ def test_a_kick_end_to_end_leaves_all_its_files_and_they_agree(
     for part in ("setting up", "compiling", "planning", "executing", "writing"):
         assert part in said.err
     with np.load(tmp_path / "kick.npz", allow_pickle=False) as file:
-        path = file["states"][:, -1, :3]
-    assert kick.miss(path, np.array(summary["target"])) == pytest.approx(summary["truth_error_m"], abs=1e-3)
+        states = file["states"]
+    task = kick.Kick.standard()
+    assert task.missed(states, 0, np.array(summary["target"])) == pytest.approx(summary["truth_error_m"], abs=1e-3)
 
 
 def test_later_kicks_of_a_preset_compile_nothing_again(small: None) -> None:
-    task = kick.Kick.standard(substeps=4)
-    first, again = (task.to((3.0, side, 0.4), preset="fast", dynamics="mujoco") for side in (0.2, -0.2))
+    session = Session(kick.Kick.standard(substeps=4), "mujoco")
+    first, again = (session.run((3.0, side, 0.4), "fast") for side in (0.2, -0.2))
     assert first.summary["compile_seconds"] > 0.0 == again.summary["compile_seconds"]
     assert first.states.shape[1:] == (14, 13) and first.joint_targets.shape[1:] == (12, 3)
     assert again.truth_error_m == again.summary["truth_error_m"] and again.recording.target[1] == -0.2
     assert "Kick to (3.00, -0.20, 0.40) m" in str(again.table.title)
-    for used in (task, first, task.planners("fast", "mujoco")[0].first):
+    for used in (session.task, session, first, session.planners("fast").first):
         assert dumps(used) and copy.deepcopy(used) is not used, "processes of a pool may take and return it"
     assert copy.deepcopy(first).truth_error_m == first.truth_error_m
 
 
 def test_a_copied_planner_plans_the_same(task: kick.Kick, small: None) -> None:
     coarse = kick.Kick.standard(substeps=4)
-    planner, window = coarse.planners("fast", "mujoco")[0].first, coarse.window((3.0, 0.2, 0.4))(0)
+    planner, window = Session(coarse, "mujoco").planners("fast").first, coarse.window((3.0, 0.2, 0.4))(0)
     plans = [
-        each.step(each.init(jax.random.key(0)), coarse.start(), window.controls, window.context, steps=window.steps)[0]
-        for each in (planner, copy.deepcopy(planner))
+        each.step(each.init(jax.random.key(0)), coarse.start(), window)[0] for each in (planner, copy.deepcopy(planner))
     ]
     np.testing.assert_array_equal(plans[0].knots, plans[1].knots)
 
@@ -187,8 +186,8 @@ def test_a_copied_planner_plans_the_same(task: kick.Kick, small: None) -> None:
 )
 def test_a_state_of_another_scene_is_refused_by_name(task: kick.Kick, state: object, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        task.checked_state(state)  # type: ignore[arg-type]
-    np.testing.assert_array_equal(task.checked_state(task.start().tolist()), task.start())
+        task.check_state(state)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(task.check_state(task.start().tolist()), task.start())
 
 
 def test_a_ball_that_is_moved_by_no_vector_is_refused_by_name(task: kick.Kick) -> None:
@@ -199,10 +198,8 @@ def test_a_ball_that_is_moved_by_no_vector_is_refused_by_name(task: kick.Kick) -
 
 
 def test_a_target_out_of_reach_is_marked_and_still_gets_a_plan(task: kick.Kick, small: None) -> None:
-    models = models_of(task.scene, "larp")
-    planners = task.planners_of(preset_of("fast"), models)
-    target = np.array([0.0, 0.0, 40.0])
-    report = task.report(task.run(planners, target, seed=0), target)
+    session, target = Session(task), np.array([0.0, 0.0, 40.0])
+    report = session.run(target, "fast").summary
     assert not report["reachable"]
     assert np.isfinite(report["truth_error_m"])
 

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from larp_model import state as packed
 from larp_model.bodies import human_and_ball
 from larp_model.errors import InputError
-from tasks.kick import Kick, wished
-from tasks.live import ROLLS, SPOTS, TARGETS, Choices, Pushed, opened, weights_for
+from tasks.kick import Kick
+from tasks.live import ROLLS, SPOTS, TARGETS, Choices, Pushed, opened, start, weights_for
 from tasks.presets import PRESETS
 from viewer import LivePage, PageClosedError, Push
 from viewer.camera import VIEWS, PictureCamera, View
@@ -44,7 +44,7 @@ def test_what_is_wished_for_at_first_is_what_is_usual(page: LivePage, kick: Kick
     assert wishes.target == (4.0, 0.0, 0.5) and wishes.spot == wishes.roll == (0.0, 0.0)
     assert (wishes.preset, wishes.dynamics, wishes.weights) == (next(iter(PRESETS)), "larp", "none")
     assert dict(wishes.terms) == {term.name: term.weight for term in kick.terms}
-    np.testing.assert_array_equal(wished(kick, wishes), kick.start())
+    np.testing.assert_array_equal(start(kick, wishes), kick.start())
 
 
 @pytest.mark.parametrize(

@@ -142,7 +142,7 @@ def test_every_style_stays_within_what_the_joints_can_do_and_moves_smoothly(styl
         targets = styles.kicks(random, HUMAN, random.integers(0, 100, COUNT), STEPS, SCENE.dt)
     else:
         targets = getattr(styles, style)(random, HUMAN, COUNT, STEPS, SCENE.dt)
-    lower, upper = styles.limits(HUMAN)
+    lower, upper = HUMAN.limits
     assert targets.shape == (COUNT, STEPS, len(SCENE.motors), 3)
     assert (targets >= lower).all() and (targets <= upper).all()
     assert np.abs(np.diff(targets, axis=1)).max() < 0.5

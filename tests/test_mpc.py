@@ -17,12 +17,13 @@ from mpc import (
     MPPI,
     Continued,
     CostTerm,
+    Fallback,
     GaussNewton,
     Gradient,
     MujocoDynamics,
     Planner,
-    Unless,
     Verified,
+    Window,
     absolute,
     evaluate,
     interpolate,
@@ -32,7 +33,7 @@ from mpc import (
 )
 from mpc.cost import curvatures
 from mpc.gauss_newton import Linearization
-from mpc.search import Search, Tried, coloured_noise, distinct, merged
+from mpc.search import Evaluations, Search, coloured_noise, distinct, merged
 
 HORIZON, KNOTS, DT = 12, 4, 0.01
 KINDS = ("linear", "cubic")
@@ -119,6 +120,7 @@ TERMS = (CostTerm("miss", _miss), CostTerm("effort", _effort, quadratic, 1e-3))
 STATE = np.eye(1, 13, 3)
 REFERENCE = np.zeros((HORIZON, 1, 3))
 TARGET = np.array([1.0, -0.5, 0.3])
+WINDOW = Window(0.0, REFERENCE, TARGET)
 PROBLEMS = {"point_mass": PointMass(), "wall": Wall(), "broken": Broken()}
 OPTIMIZERS: dict[str, Any] = {
     "cem": CEM(samples=32, rounds=4, elites=6),
@@ -128,7 +130,10 @@ OPTIMIZERS: dict[str, Any] = {
     "mppi": MPPI(samples=32, rounds=4, elites=4),
     "gauss_newton": GaussNewton(rounds=3, directions=6, jacobian="forward"),
     "differences": GaussNewton(rounds=3, directions=6, elites=2),
-    "unless": (GaussNewton(rounds=1, directions=3), Unless((("miss", 1e-3),), (CEM(24, 2, 5), GaussNewton(rounds=1)))),
+    "fallback": (
+        GaussNewton(rounds=1, directions=3),
+        Fallback((("miss", 1e-3),), (CEM(24, 2, 5), GaussNewton(rounds=1))),
+    ),
     "small_rounds": (Gradient(steps=2, elites=9), CEM(samples=8, rounds=6, elites=4), GaussNewton(directions=3)),
 }
 
@@ -151,8 +156,8 @@ def quick_compilation() -> Iterator[None]:
 def test_every_planner_keeps_the_contract(problem: str, optimizers: str) -> None:
     planner = _planner(PROBLEMS[problem], OPTIMIZERS[optimizers])
     first = planner.init(jax.random.key(7))
-    plan, info = planner.step(first, STATE, REFERENCE, TARGET)
-    again, same = planner.step(first, STATE, REFERENCE, TARGET)
+    plan, info = planner.step(first, STATE, WINDOW)
+    again, same = planner.step(first, STATE, WINDOW)
 
     assert plan.knots.shape == (KNOTS, 1, 3) and info.states.shape == (HORIZON, 1, 13)
     assert jax.tree.map(jnp.shape, plan) == jax.tree.map(jnp.shape, first)
@@ -177,7 +182,7 @@ def test_every_planner_keeps_the_contract(problem: str, optimizers: str) -> None
     expected = planner.dynamics.rollout(jnp.asarray(STATE)[None], jnp.asarray(controls)[None])[0]
     np.testing.assert_allclose(info.states, expected, atol=1e-5)
 
-    onward, later = planner.step(plan, STATE, REFERENCE, TARGET)
+    onward, later = planner.step(plan, STATE, WINDOW)
     assert later.cost <= info.cost
     assert (onward.key != plan.key).all()
 
@@ -185,13 +190,13 @@ def test_every_planner_keeps_the_contract(problem: str, optimizers: str) -> None
 def test_target_weights_and_time_compile_nothing_again() -> None:
     planner = _planner()
     plan = planner.init(jax.random.key(0), now=1.0)
-    assert planner.compile(STATE, REFERENCE, TARGET) > 0
-    plan, info = planner.step(plan, STATE, REFERENCE, TARGET, {"effort": 0}, now=1.0)
+    assert planner.compile(STATE, WINDOW) > 0
+    plan, info = planner.step(plan, STATE, WINDOW._replace(time=1.0, weights={"effort": 0}))
     assert info.terms["effort"] == 0
     single = STATE.astype(np.float32)
-    other, info = planner.step(plan, single, REFERENCE + 0.01, -TARGET, {"miss": 2.5}, now=1.02)
+    other, info = planner.step(plan, single, Window(1.02, REFERENCE + 0.01, -TARGET, weights={"miss": 2.5}))
     assert info.compile_seconds == 0 and float(other.start) == pytest.approx(1.02)
-    assert planner.step(other, STATE, REFERENCE, TARGET, now=7)[1].compile_seconds == 0
+    assert planner.step(other, STATE, WINDOW._replace(time=7.0))[1].compile_seconds == 0
 
 
 class Hollows:
@@ -200,11 +205,11 @@ class Hollows:
     def __init__(self) -> None:
         self.asked = 0
 
-    def tries(self, knots: np.ndarray) -> Tried:
+    def evaluate(self, knots: np.ndarray) -> Evaluations:
         x = knots[:, :1, 0, 0]
         self.asked += len(x)
         residual = np.where(x < 1.0, 0.5 + np.abs(x), x - 2.0)
-        return Tried(np.sum(residual**2, axis=1), {"miss": residual}, {"miss": np.full_like(residual, 2.0)})
+        return Evaluations(np.sum(residual**2, axis=1), {"miss": residual}, {"miss": np.full_like(residual, 2.0)})
 
 
 def _at(x: float, elites: int) -> Search:
@@ -214,58 +219,57 @@ def _at(x: float, elites: int) -> Search:
     return Search(knots[0], spread, knots, np.full(elites, np.inf, np.float32), spread[0])
 
 
-def test_unless_leaves_a_hollow_and_asks_for_one_candidate_where_nothing_is_amiss() -> None:
+def test_a_fallback_leaves_a_hollow_and_takes_one_candidate_where_the_search_has_converged() -> None:
     steps = GaussNewton(rounds=6, directions=4)
-    unless = Unless((("miss", 0.1),), (CEM(24, 6, 6, decay=1.0), steps))
-    stuck, problem = _at(0.0, unless.elites), Hollows()
+    fallback = Fallback((("miss", 0.1),), (CEM(24, 6, 6, decay=1.0), steps))
+    stuck, problem = _at(0.0, fallback.elites), Hollows()
     alone = steps.improve(stuck, np.random.default_rng(0), problem)  # type: ignore[arg-type]
-    assert problem.tries(alone.elites[:1]).costs[0] > 0.24
-    freed = unless.improve(alone, np.random.default_rng(0), problem)  # type: ignore[arg-type]
-    assert problem.tries(freed.elites[:1]).costs[0] < 1e-4
+    assert problem.evaluate(alone.elites[:1]).costs[0] > 0.24
+    freed = fallback.improve(alone, np.random.default_rng(0), problem)  # type: ignore[arg-type]
+    assert problem.evaluate(freed.elites[:1]).costs[0] < 1e-4
 
     problem = Hollows()
-    assert unless.improve(freed, np.random.default_rng(0), problem) is freed  # type: ignore[arg-type]
+    assert fallback.improve(freed, np.random.default_rng(0), problem) is freed  # type: ignore[arg-type]
     assert problem.asked == 1
 
 
-def test_unless_refuses_what_it_cannot_judge_by() -> None:
+def test_a_fallback_refuses_a_tolerance_of_no_cost_term() -> None:
     steps, problem = GaussNewton(), Hollows()
-    unless = Unless((("speed", 0.1),), (steps,))
-    with pytest.raises(InputError, match="enough: got 'speed', needs names of cost terms: miss"):
-        unless.improve(_at(0.0, 1), np.random.default_rng(0), problem)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="enough: got nan for 'miss', needs a finite number >= 0"):
-        Unless((("miss", np.nan),), (steps,))
+    fallback = Fallback((("speed", 0.1),), (steps,))
+    with pytest.raises(InputError, match="tolerance: got 'speed', needs names of cost terms: miss"):
+        fallback.improve(_at(0.0, 1), np.random.default_rng(0), problem)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="tolerance: got nan for 'miss', needs a finite number >= 0"):
+        Fallback((("miss", np.nan),), (steps,))
     with pytest.raises(InputError, match="needs some of both"):
-        Unless((), (steps,))
+        Fallback((), (steps,))
     with pytest.raises(InputError, match="optimizers: got Verified, which must come last of all"):
-        Unless((("miss", 0.1),), (Verified(PointMass(), steps),))
+        Fallback((("miss", 0.1),), (Verified(PointMass(), steps),))
 
 
 def test_locked_axis_never_moves() -> None:
     spread = [[0.1, 0.0, 0.1]]
     planner = _planner(optimizers=OPTIMIZERS["cem_gradient"], spread=spread, interpolation="linear")
-    plan, _ = planner.step(planner.init(jax.random.key(0)), STATE, REFERENCE, TARGET)
+    plan, _ = planner.step(planner.init(jax.random.key(0)), STATE, WINDOW)
     assert (plan.elites[..., 1] == 0).all() and (plan.knots[..., 0] != 0).all()
 
 
 def test_wrong_arguments_are_refused_by_name() -> None:
     planner = _planner()
     plan = planner.init(jax.random.key(0), now=1.0)
-    step = {"plan": plan, "state": STATE, "reference": REFERENCE, "context": TARGET, "now": 1.0}
+    window = WINDOW._replace(time=1.0)
     other = Planner(PointMass(), TERMS, HORIZON, KNOTS + 1, DT, np.ones((1, 3)), CEM()).init(jax.random.key(0))
-    wrong_steps: list[dict[str, Any]] = [
-        {"state": STATE[0]},
-        {"state": STATE * np.nan},
-        {"reference": REFERENCE[1:]},
-        {"now": 0.5},
-        {"now": np.nan},
-        {"plan": other},
-        {"weights": {"mis": 1.0}},
-        {"weights": {"miss": np.nan}},
-    ]
-    for wrong in wrong_steps:
-        with pytest.raises(InputError, match=next(iter(wrong)).removesuffix("s")):
-            planner.step(**{**step, **wrong})
+    for name, call in (
+        ("state", (plan, STATE[0], window)),
+        ("state", (plan, STATE * np.nan, window)),
+        ("reference", (plan, STATE, window._replace(reference=REFERENCE[1:]))),
+        ("window.time", (plan, STATE, window._replace(time=0.5))),
+        ("window.time", (plan, STATE, window._replace(time=np.nan))),
+        ("plan", (other, STATE, window)),
+        ("window.weights", (plan, STATE, window._replace(weights={"mis": 1.0}))),
+        ("weight of 'miss'", (plan, STATE, window._replace(weights={"miss": np.nan}))),
+    ):
+        with pytest.raises(InputError, match=name):
+            planner.step(*call)
     wrong_planners: list[dict[str, Any]] = [
         {"spread": [0.1, 0.1, 0.1]},
         {"spread": [[0.1, np.nan, 0.1]]},
@@ -341,7 +345,7 @@ def test_an_engine_computes_only_the_steps_that_suffice_and_repeats_the_last(ste
 
 def test_the_prediction_goes_on_from_the_last_step_that_suffices() -> None:
     planner = _planner(Continued(MujocoDynamics(Engine()), Drift(), slice(0, 1), 5))
-    _, info = planner.step(planner.init(jax.random.key(0)), STATE, REFERENCE, TARGET, steps=4)
+    _, info = planner.step(planner.init(jax.random.key(0)), STATE, WINDOW._replace(steps=4))
     assert len(info.states) == 4 + 5
     np.testing.assert_allclose(np.diff(info.states[3:, 0, :3], axis=0), 1.0, rtol=1e-5)
 
@@ -350,12 +354,12 @@ def test_the_prediction_goes_on_from_the_last_step_that_suffices() -> None:
 def test_steps_that_are_not_in_the_horizon_are_refused(steps: int) -> None:
     planner = _planner(MujocoDynamics(Engine()))
     with pytest.raises(InputError, match="steps"):
-        planner.step(planner.init(jax.random.key(0)), STATE, REFERENCE, TARGET, steps=steps)
+        planner.step(planner.init(jax.random.key(0)), STATE, WINDOW._replace(steps=steps))
 
 
 def test_planner_runs_on_an_engine() -> None:
     planner = _planner(MujocoDynamics(Engine()))
-    _, info = planner.step(planner.init(jax.random.key(0)), STATE, REFERENCE, TARGET)
+    _, info = planner.step(planner.init(jax.random.key(0)), STATE, WINDOW)
     assert info.cost < 0.5 * TARGET @ TARGET and 0 < info.finite < info.candidates
 
 
@@ -467,13 +471,13 @@ class Ripples:
         cost = jnp.sum((knots - 0.3) ** 2 - 0.1 * jnp.cos(9 * knots), axis=(1, 2, 3))
         return jnp.where((knots < -1).any(axis=(1, 2, 3)), jnp.inf, cost)
 
-    def tries(self, knots: np.ndarray) -> Tried:
+    def evaluate(self, knots: np.ndarray) -> Evaluations:
         self.counted += 1
-        return Tried(np.asarray(self.cost(knots)), {}, {})
+        return Evaluations(np.asarray(self.cost(knots)), {}, {})
 
     def gradients(self, knots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         slope = jax.grad(lambda each: jnp.sum(jnp.where(jnp.isfinite(self.cost(each)), self.cost(each), 0.0)))(knots)
-        return self.tries(knots).costs, np.array(slope)
+        return self.evaluate(knots).costs, np.array(slope)
 
     def lost(self, count: int) -> None:
         self.missing += count
@@ -515,7 +519,7 @@ def _line(dynamics: Any = None, terms: Any = TERMS[:1], **settings: Any) -> tupl
     planner = Planner(
         dynamics or PointMass(), terms, HORIZON, KNOTS, DT, np.full((1, 3), 0.1), GaussNewton(**settings),
     )  # fmt: skip
-    return planner, *planner.step(planner.init(jax.random.key(1)), STATE, REFERENCE, TARGET)
+    return planner, *planner.step(planner.init(jax.random.key(1)), STATE, WINDOW)
 
 
 @pytest.mark.parametrize("jacobian", ["forward", "differences"])
@@ -528,8 +532,8 @@ def test_one_step_of_gauss_newton_solves_what_is_linear(jacobian: str) -> None:
 @pytest.mark.parametrize("rounds", [1, 3])
 def test_rounds_of_differences_ask_for_one_rollout_each_and_one_at_first(rounds: int) -> None:
     class Bowl(Ripples):
-        def tries(self, knots: np.ndarray) -> Tried:
-            found, flat = super().tries(knots), knots.reshape(len(knots), -1)
+        def evaluate(self, knots: np.ndarray) -> Evaluations:
+            found, flat = super().evaluate(knots), knots.reshape(len(knots), -1)
             return found._replace(residuals={"miss": flat - 0.3}, curvatures={"miss": np.ones_like(flat)})
 
     problem, search = Bowl(), _search()
@@ -552,7 +556,7 @@ def test_few_candidates_are_rolled_out_as_many_at_a_time_as_the_dynamics_say() -
 
     for dynamics in (Wide(), Continued(Wide(), Drift(), slice(0, 1), 2)):
         planner = _planner(dynamics, CEM(samples=15, rounds=1, elites=3))
-        planner.step(planner.init(jax.random.key(0)), STATE, REFERENCE, TARGET)
+        planner.step(planner.init(jax.random.key(0)), STATE, WINDOW)
     assert sizes == {12}
 
 
@@ -570,7 +574,7 @@ def test_where_nothing_depends_on_the_controls_the_plan_stays() -> None:
 
 def test_a_spread_of_zero_leaves_the_plan_where_it_is() -> None:
     planner = _planner(optimizers=GaussNewton(), spread=np.zeros((1, 3)))
-    plan, info = planner.step(planner.init(jax.random.key(0)), STATE, REFERENCE, TARGET)
+    plan, info = planner.step(planner.init(jax.random.key(0)), STATE, WINDOW)
     assert not plan.knots.any() and np.isfinite(info.cost)
 
 
@@ -592,12 +596,12 @@ class Torn:
 
 def test_differences_take_nothing_from_candidates_that_are_lost() -> None:
     class Treacherous(Ripples):
-        def tries(self, knots: np.ndarray) -> Tried:
-            return Tried(np.array([0.5, np.inf], np.float32), {"miss": np.array([[0.9], [0.0]])}, {})
+        def evaluate(self, knots: np.ndarray) -> Evaluations:
+            return Evaluations(np.array([0.5, np.inf], np.float32), {"miss": np.array([[0.9], [0.0]])}, {})
 
-    here = Tried(np.array([0.6]), {"miss": np.array([[1.0]])}, {})
+    here = Evaluations(np.array([0.6]), {"miss": np.array([[1.0]])}, {})
     directions, problem = np.ones((2, KNOTS, 1, 3), np.float32), Treacherous()
-    linearization = Linearization(_search().mean, here, directions, problem.tries(directions))
+    linearization = Linearization(_search().mean, here, directions, problem.evaluate(directions))
     found = GaussNewton(directions=2, step=0.1).derivatives(linearization, problem)  # type: ignore[arg-type]
     np.testing.assert_allclose(found["miss"], [[-1.0], [0.0]])
 
@@ -615,7 +619,7 @@ class Away:
 
 def test_gauss_newton_looks_around_where_nothing_comes_back() -> None:
     planner = _planner(Away(), GaussNewton(rounds=4, directions=8))
-    _, info = planner.step(planner.init(jax.random.key(0)), STATE, REFERENCE, TARGET)
+    _, info = planner.step(planner.init(jax.random.key(0)), STATE, WINDOW)
     assert not np.isfinite(info.costs[0]).any()
     assert info.cost < 0.01
 
@@ -639,31 +643,31 @@ def test_derivatives_that_are_not_finite_leave_the_plan_and_are_counted() -> Non
 
 def test_planners_of_one_problem_share_what_is_compiled() -> None:
     first = _planner(optimizers=CEM(samples=16, rounds=2, elites=3, decay=1.0))
-    plan, info = first.step(first.init(jax.random.key(0)), STATE, REFERENCE, TARGET)
+    plan, info = first.step(first.init(jax.random.key(0)), STATE, WINDOW)
     again = first.using((MPPI(samples=16, rounds=3, elites=3), GaussNewton(directions=16, elites=3)))
-    assert first.using(MPPI(samples=2, rounds=1, elites=3)).compile(STATE, REFERENCE, TARGET) == 0  # few: one size
-    _, second = again.step(plan, STATE, REFERENCE, TARGET)
+    assert first.using(MPPI(samples=2, rounds=1, elites=3)).compile(STATE, WINDOW) == 0  # few: one size
+    _, second = again.step(plan, STATE, WINDOW)
     assert info.compile_seconds > 0 and second.compile_seconds == 0
     assert second.cost <= info.cost
 
 
 def test_the_fan_around_a_plan_is_of_its_problem_always_the_same_and_compiles_nothing() -> None:
     planner = _planner(optimizers=CEM(samples=16, rounds=1, elites=3))
-    plan, info = planner.step(planner.init(jax.random.key(0)), STATE, REFERENCE, TARGET)
-    costs, states = planner.fan(plan, STATE, REFERENCE, TARGET, count=12)
+    plan, info = planner.step(planner.init(jax.random.key(0)), STATE, WINDOW)
+    costs, states = planner.fan(plan, STATE, WINDOW, count=12)
     assert costs.shape == (12,) and states.shape == (12, *info.states.shape)
     assert costs.min() >= 0.0 and np.isfinite(costs).all() and (costs != costs[0]).any()
-    again, _ = planner.fan(plan, STATE, REFERENCE, TARGET, count=12)
+    again, _ = planner.fan(plan, STATE, WINDOW, count=12)
     np.testing.assert_array_equal(costs, again)
-    assert planner.step(plan, STATE, REFERENCE, TARGET)[1].compile_seconds == 0
+    assert planner.step(plan, STATE, WINDOW)[1].compile_seconds == 0
 
 
 def test_a_plan_goes_on_in_a_planner_that_keeps_more_elites_or_fewer() -> None:
     few, many = CEM(samples=16, rounds=1, elites=3), CEM(samples=32, rounds=1, elites=9)
     planner = _planner(optimizers=few)
-    plan, before = planner.step(planner.init(jax.random.key(0)), STATE, REFERENCE, TARGET)
+    plan, before = planner.step(planner.init(jax.random.key(0)), STATE, WINDOW)
     for optimizer in (many, few):
-        plan, info = planner.using(optimizer).step(plan, STATE, REFERENCE, TARGET)
+        plan, info = planner.using(optimizer).step(plan, STATE, WINDOW)
         assert len(plan.elites) == optimizer.elites and info.cost <= before.cost
 
 
@@ -672,18 +676,19 @@ class Nudge:
     """Anyone's own optimiser: a step along each axis of the first knot."""
 
     differentiates = False
+    terminal = False
     elites = 1
 
     def improve(self, search: Search, random: Any, problem: Any) -> Search:
         knots = np.repeat(search.elites[:1], 4, axis=0)
         knots[1:, 0, 0] += 0.1 * np.eye(3, dtype=np.float32)
-        costs = problem.tries(knots).costs
+        costs = problem.evaluate(knots).costs
         return merged(search, knots, costs)
 
 
 def test_the_planner_takes_anyones_own_optimiser() -> None:
     planner = _planner(optimizers=(Nudge(), CEM(samples=16, rounds=1, elites=4), Nudge()))
-    _, info = planner.step(planner.init(jax.random.key(0)), STATE, REFERENCE, TARGET)
+    _, info = planner.step(planner.init(jax.random.key(0)), STATE, WINDOW)
     assert info.candidates == 4 + 16 + 4
     assert info.cost == pytest.approx(min(costs.min() for costs in info.costs), rel=1e-5)
 

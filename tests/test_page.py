@@ -18,7 +18,7 @@ import viser
 from matplotlib.image import imread
 
 from mpc import CEM
-from tasks.kick import Kick, wished
+from tasks.kick import Kick
 from tasks.live import Choices, Live
 from tasks.presets import Preset
 from viewer import LivePage, Wishes, write_html
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not instal
 
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 FEW = (CEM(samples=8, rounds=1, elites=2),)
-QUICK, OTHER = Preset(FEW, FEW, every=50, stand=FEW), Preset(FEW, FEW, every=25, stand=FEW)
+QUICK, OTHER = Preset(FEW, FEW, interval=50, recovery=FEW), Preset(FEW, FEW, interval=25, recovery=FEW)
 TARGET = np.array([3.0, 0.2, 0.4])
 # A browser without a GPU draws so many pixels in time.
 SMALL = (640, 400)
@@ -69,7 +69,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     weights = {"none": None, "others": Path("others.json")}
     choices = Choices(tasks, {"quick": QUICK, "other": OTHER}, ("mujoco", "larp"), weights)
     with LivePage(port=0, offer=choices.offer(task)) as page:
-        live = Live(page, choices, TARGET, tmp_path_factory.mktemp("kept"), start=wished)
+        live = Live(page, choices, TARGET, tmp_path_factory.mktemp("kept"))
         thread = threading.Thread(target=live.serve)
         thread.start()
         until(lambda: page.mode == "planned", 120.0)

@@ -29,19 +29,19 @@ def candidates(stages: tuple[Optimizer, ...]) -> int:
 def test_a_scaled_preset_tries_so_many_times_the_candidates(name: str, factor: float) -> None:
     preset = PRESETS[name]
     found = scaled(preset, Seconds(factor, factor, factor))
-    for before, after in ((preset.first, found.first), (preset.again, found.again)):
+    for before, after in ((preset.first, found.first), (preset.replan, found.replan)):
         assert candidates(after) == pytest.approx(max(8, factor * candidates(before)), rel=0.35)
 
 
 @pytest.mark.parametrize("seconds", [0.5, 2.0])
 def test_a_preset_within_a_time_takes_that_time(seconds: float) -> None:
     def measure(preset: Preset) -> Seconds:
-        return Seconds(*(0.01 + 2e-3 * candidates(each) for each in (preset.first, preset.again, preset.stand)))
+        return Seconds(*(0.01 + 2e-3 * candidates(each) for each in (preset.first, preset.replan, preset.recovery)))
 
     found = measure(within(PRESETS["balanced"], seconds, measure))
     assert found.first == pytest.approx(seconds, rel=0.1)
-    assert found.again == pytest.approx(0.2 * seconds, rel=0.1)
-    assert found.stand <= 0.22 * seconds
+    assert found.replan == pytest.approx(0.2 * seconds, rel=0.1)
+    assert found.recovery <= 0.22 * seconds
 
 
 @pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf")])
@@ -52,7 +52,7 @@ def test_a_budget_that_is_no_time_is_refused(seconds: float) -> None:
 
 def test_a_budget_below_what_the_preset_can_do_says_what_the_least_is() -> None:
     def measure(preset: Preset) -> Seconds:
-        return Seconds(*(0.01 + 2e-3 * candidates(each) for each in (preset.first, preset.again, preset.stand)))
+        return Seconds(*(0.01 + 2e-3 * candidates(each) for each in (preset.first, preset.replan, preset.recovery)))
 
     with pytest.raises(InputError, match=r"budget is 0\.02 s, but the least .* 0\.026 s"):
         within(PRESETS["balanced"], 0.02, measure)
@@ -64,22 +64,24 @@ def test_an_unknown_preset_lists_the_known_ones() -> None:
 
 
 def test_any_field_of_a_preset_can_be_changed_by_its_name() -> None:
-    found = changed(PRESETS["fast"], ["every=2", "again.0.rounds=3", "verify=(4, 2)", "enough=1"])
-    assert (found.every, found.verify, found.enough) == (2, (4, 2), 1)
-    assert found.again == (GaussNewton(rounds=3), *PRESETS["fast"].again[1:]) and found.first == PRESETS["fast"].first
+    found = changed(PRESETS["fast"], ["interval=2", "replan.0.rounds=3", "verify=(4, 2)", "tolerance=1"])
+    assert (found.interval, found.verify, found.tolerance) == (2, (4, 2), 1)
+    assert found.replan == (GaussNewton(rounds=3), *PRESETS["fast"].replan[1:]) and found.first == PRESETS["fast"].first
 
 
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        ("every", "must be NAME=VALUE"),
-        ("every=often", "must be NAME=VALUE"),
-        ("every=2.5", "what it changes is 5"),
-        ("evry=2", "did you mean 'every'"),
-        ("again.2.rounds=3", "must be one of 0"),
-        ("again.0=3", "what it changes is GaussNewton"),
-        ("again.0.round=3", "did you mean 'rounds'"),
-        ("every.more=2", "'more'"),
+        ("interval", "must be NAME=VALUE"),
+        ("interval=often", "must be NAME=VALUE"),
+        ("interval=2.5", "what it changes is 5"),
+        ("intervl=2", "did you mean 'interval'"),
+        ("every=2", "every is called interval now"),
+        ("again.0.rounds=3", "again is called replan now"),
+        ("replan.2.rounds=3", "must be one of 0"),
+        ("replan.0=3", "what it changes is GaussNewton"),
+        ("replan.0.round=3", "did you mean 'rounds'"),
+        ("interval.more=2", "'more'"),
     ],
 )
 def test_a_change_that_makes_no_sense_is_refused_by_name(change: str, complaint: str) -> None:
@@ -90,15 +92,15 @@ def test_a_change_that_makes_no_sense_is_refused_by_name(change: str, complaint:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ("every=0", "every is 0, but must be an integer of at least 1"),
-        ("every=-3", "every is -3"),
+        ("interval=0", "interval is 0, but must be an integer of at least 1"),
+        ("interval=-3", "interval is -3"),
         ("candidates=0", "candidates is 0"),
         ("verify=(2,)", r"verify is \(2,\), but must be two integers of at least 0"),
         ("verify=('a', 1)", "verify is "),
         ("verify=(1, -1)", "verify is "),
-        ("enough=-1.0", "enough is -1.0"),
-        ("enough=1e999", "enough is inf"),
-        ("again.0.rounds=0", "rounds: got 0, needs at least 1"),
+        ("tolerance=-1.0", "tolerance is -1.0"),
+        ("tolerance=1e999", "tolerance is inf"),
+        ("replan.0.rounds=0", "rounds: got 0, needs at least 1"),
         ("first=()", r"first is \(\), but must be a tuple of at least one optimiser"),
         ("first=(1,)", "first holds 1, which is no optimiser"),
     ],
@@ -113,6 +115,7 @@ def test_an_optimiser_that_cannot_be_compared_is_refused_by_name() -> None:
     class Mine:
         elites = 1
         differentiates = False
+        terminal = False
 
         def improve(self, search: Search, random: np.random.Generator, problem: Problem) -> Search:
             return search

@@ -118,9 +118,9 @@ class Lost:
 @pytest.mark.parametrize("every", [3, 10])
 def test_a_world_that_diverges_ends_the_execution_and_names_the_step(every: int) -> None:
     planner = stability.toy(stability.Shaky(np.inf), CEM(samples=4, rounds=1, elites=2))
-    phase = Phase(planner, planner, every, lambda step: Window(np.zeros((6, 1, 3)), None))
+    phase = Phase(planner, planner, every, lambda step: Window(0.01 * step, np.zeros((6, 1, 3))))
     with pytest.raises(DivergenceError, match="diverged in step 2"):
-        execute(Lost(), np.zeros((1, 13)), (phase,), 5, jax.random.key(0), 0.01)
+        execute(Lost(), np.zeros((1, 13)), (phase,), 5, jax.random.key(0))
 
 
 def test_what_the_engine_lost_is_nan_and_its_neighbours_are_not() -> None:

@@ -57,7 +57,7 @@ def test_a_point_is_beaten_only_by_what_is_a_tenth_better_in_both() -> None:
 
 def test_a_point_is_measured_and_drawn(tmp_path: Path) -> None:
     search = (CEM(samples=16, rounds=1, elites=4),)
-    point = Point(Preset(search, search, every=40), "mujoco", 4)
+    point = Point(Preset(search, search, interval=40), "mujoco", 4)
     row = tradeoff.measure(kick.Kick.standard(substeps=4), point, None, targets=2, seed=0)
     assert row["point"] == "mujoco 4: CEM 16x1 / CEM 16x1 every 40" and row["family"] == "mujoco"
     assert len(row["truth_errors_m"]) == 2
@@ -75,8 +75,8 @@ def test_ways_to_search_are_fitted_into_the_time_measured_and_told(monkeypatch: 
         given.append(seconds)
         return scaled(preset, Seconds(0.2, 0.2, 0.2))
 
-    monkeypatch.setattr("tasks.task.within", fifth)
+    monkeypatch.setattr("tasks.session.within", fifth)
     row = optimizers.compare(kick.Kick.standard(substeps=4), "Gauss-Newton, differences", None, 0.3, targets=1, seed=0)
     assert given == [0.3] and row["plan_seconds"] > 0.0
     assert "Gauss-Newton, differences (GN 24x2 " in report.markdown(optimizers.table_of([row], 0.3))
-    assert all(Point(Preset(*way, every=5)).name for way in optimizers.WAYS.values())
+    assert all(Point(Preset(*way, interval=5)).name for way in optimizers.WAYS.values())

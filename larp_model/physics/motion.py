@@ -64,7 +64,7 @@ class Articulation(NamedTuple):
     angular_jerk: Array
 
 
-Begun = tuple[Array, Array, Array, Array]
+Carry = tuple[Array, Array, Array, Array]
 """Start of a stage: heights (n, 1, B) and rotation vectors (n, 3, B) gained, velocities and spins (n, 3, B)."""
 
 
@@ -106,7 +106,7 @@ def articulated_motion(
 
     ratio = (1.0 - GAMMA) / GAMMA
 
-    def advance(begun: Begun, nothing: None) -> tuple[Begun, tuple[tuple[Array, Array], tuple[Inertia, Anchors]]]:
+    def advance(begun: Carry, nothing: None) -> tuple[Carry, tuple[tuple[Array, Array], tuple[Inertia, Anchors]]]:
         raised, turned, velocity, spin = begun
         after, tree = stage(raised, turned, velocity, spin)
         late = (1.0 - GAMMA) * dt

@@ -30,7 +30,8 @@ from tasks.command import prepare_jax, run
 from tasks.data import random_task
 from tasks.kick import Kick
 from tasks.models import Models, models_of
-from tasks.presets import preset_of
+from tasks.run import plans_of
+from tasks.session import Session
 
 # A candidate is one of the plan's elites, moved by this share of the spread of a first plan.
 AROUND = 0.1
@@ -39,13 +40,13 @@ MARKS = ("#0072b2", "#e69f00", "#d55e00")
 
 
 def candidates_of(
-    kick: Kick, models: Models, truth: Models, targets: int, candidates: int, seed: int
+    session: Session, truth: Models, targets: int, candidates: int, seed: int
 ) -> tuple[list[dict[str, Any]], Episodes]:
     """Return model cost and ground-truth cost of candidates around each first, middle and last plan.
 
     Returns a row for each plan, and the ground-truth episodes of all candidates.
     """
-    planners = kick.planners_of(preset_of("balanced"), models)
+    kick, planners = session.task, session.planners("balanced")
     spread, random = planners.first.scale, np.random.default_rng(seed)
 
     def costs_in(dynamics: Dynamics) -> Callable[..., tuple[jax.Array, jax.Array]]:
@@ -57,19 +58,19 @@ def candidates_of(
 
         return costs
 
-    in_model, in_truth = costs_in(models.whole), costs_in(truth.whole)
+    in_model, in_truth = costs_in(session.models.whole), costs_in(truth.whole)
     rows, parts = [], []
     for index in track(range(targets), description="plans", disable=not sys.stderr.isatty()):
         target, shift = random_task(random)
-        execution = kick.run(planners, target, seed + index, kick.start(shift), steps=kick.reference.strike + 5)
-        plans = kick.plans(execution)
+        until = kick.reference.strike + 5
+        plans = plans_of(session.execute(planners, target, seed + index, kick.start(shift), until))
         for replan in (plans[0], plans[len(plans) // 2], plans[-1]):
             window = kick.window(target)(replan.step)
             elites = replan.plan.elites[np.arange(candidates) % len(replan.plan.elites)]
             noise = coloured_noise(np.random.default_rng(seed + index), elites.shape, 2.0)
             tried = elites + AROUND * spread * noise
             controls = jnp.stack(
-                [planners.first.controls(replan.plan._replace(elites=each[None]), window.controls) for each in tried]
+                [planners.first.controls(replan.plan._replace(elites=each[None]), window.reference) for each in tried]
             )
             context = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), window.context)
             state = jnp.asarray(replan.state, jnp.float32)
@@ -135,8 +136,8 @@ def main(
     report.ready(json, publish, weights)
     prepare_jax()
     kick = Kick.standard()
-    models, truth = models_of(kick.scene, "larp", weights), models_of(kick.scene, "mujoco")
-    rows, episodes = candidates_of(kick, models, truth, targets, candidates, seed)
+    truth = models_of(kick.scene, "mujoco")
+    rows, episodes = candidates_of(Session(kick, "larp", weights), truth, targets, candidates, seed)
     simulator = Simulator.of_physics(kick.scene) if weights is None else Simulator.load(weights, kick.scene)
     launch = evaluation.launched(simulator, episodes)
     ranks = {

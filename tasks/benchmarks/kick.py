@@ -17,11 +17,13 @@ from tasks.benchmarks import report
 from tasks.command import prepare_jax, run
 from tasks.data import random_roll, random_task
 from tasks.kick import USUAL, Kick
-from tasks.models import DynamicsName, Models, models_of
+from tasks.models import DynamicsName
 from tasks.motions.people import random_people
 from tasks.presets import PresetName, preset_of
+from tasks.run import replayed, summarize
 from tasks.sensing import noisy
-from tasks.task import HEIGHT, Planners
+from tasks.session import Planners, Session
+from tasks.task import HEIGHT
 
 WITHIN = (0.1, 0.25, 0.5)
 
@@ -141,10 +143,10 @@ def main(
     report.ready(json, publish, weights)
     prepare_jax()
 
-    def planned(kick: Kick) -> tuple[Kick, Models, Planners]:
-        models = models_of(kick.scene, dynamics, weights)
-        fitting = chosen if budget is None else kick.within(chosen, budget, models, USUAL)
-        return kick, models, kick.planners_of(fitting, models)
+    def planned(kick: Kick) -> tuple[Session, Planners]:
+        session = Session(kick, dynamics, weights)
+        fitting = chosen if budget is None else session.within(chosen, budget, USUAL)
+        return session, session.planners(fitting)
 
     usual = Kick.standard(reference, height, body=body, self_contact=self_contact, substeps=substeps)
     people = random_people(np.random.default_rng((seed, 1)), usual.scene, targets)
@@ -152,16 +154,15 @@ def main(
     random = np.random.default_rng(seed)
 
     def one(index: int, target: np.ndarray, shift: np.ndarray, roll: np.ndarray) -> report.Row:
-        kick, models, planners = always or planned(
-            Kick.of(usual.scene.sized(people[index]), reference, substeps=substeps)
-        )
+        session, planners = always or planned(Kick.of(usual.scene.sized(people[index]), reference, substeps=substeps))
+        kick = session.task
         sense = noisy(kick.scene, np.random.default_rng((seed, index))) if noise else lambda state: state
-        execution = kick.run(planners, target, seed + index, kick.start(shift, roll), sense=sense)
-        return kick.report(execution, target) | {
-            "halved_error_m": kick.replayed(execution, target, 2 * substeps),
+        execution = session.execute(planners, target, seed + index, kick.start(shift, roll), sense=sense)
+        return summarize(kick, execution, target) | {
+            "halved_error_m": replayed(kick, execution, target, 2 * substeps),
             "preset": preset,
             "dynamics": dynamics,
-            "weights": models.weights,
+            "weights": session.models.weights,
             "seed": seed + index,
             "ball_shift": shift.tolist(),
             "ball_velocity": roll.tolist(),

@@ -13,8 +13,8 @@ from tasks.benchmarks import report
 from tasks.benchmarks.tradeoff import Point, measure
 from tasks.command import prepare_jax, run
 from tasks.kick import USUAL, Kick
-from tasks.models import models_of
 from tasks.presets import Preset, Stage
+from tasks.session import Session
 
 SAMPLING, SOME = CEM(samples=64, rounds=16, elites=12, decay=1.0), CEM(samples=32, rounds=4, elites=8, decay=1.0)
 FORWARD = GaussNewton(rounds=12, jacobian="forward")
@@ -31,9 +31,8 @@ WAYS: dict[str, tuple[Stage, Stage]] = {
 
 def compare(kick: Kick, name: str, weights: Path | None, seconds: float, targets: int, seed: int) -> report.Row:
     """Measure an optimiser, its first plan scaled to `seconds` and each replan to a fifth of them."""
-    first, again = WAYS[name]
-    models = models_of(kick.scene, "larp", weights)
-    preset = kick.within(Preset(first, again, every=5), seconds, models, USUAL)
+    first, replan = WAYS[name]
+    preset = Session(kick, "larp", weights).within(Preset(first, replan, interval=5), seconds, USUAL)
     return measure(kick, Point(preset), weights, targets, seed) | {"way": name}
 
 

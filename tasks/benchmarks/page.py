@@ -32,9 +32,10 @@ from mpc.loop import Execution
 from tasks.benchmarks import report
 from tasks.command import prepare_jax, run
 from tasks.data import random_task
-from tasks.kick import USUAL, Kick, wished
+from tasks.kick import USUAL, Kick
 from tasks.live import Choices, Live, due, weights_for
 from tasks.presets import PRESETS, PresetName
+from tasks.session import Session
 from viewer import LivePage
 
 # One in `SLOW` clients is slow: it waits `PATIENCE` [s] before each message.
@@ -160,10 +161,11 @@ def main(
     kick = Kick.standard()
     choices = Choices({"embedded": lambda: kick}, {preset: PRESETS[preset]}, ("larp",), weights_for(None))
     process, begun = psutil.Process(), time.monotonic()
-    kick.to(USUAL, preset)  # what plans and steps keeps its threads
+    session = Session(kick)
+    session.run(USUAL, preset)  # what plans and steps keeps its threads
     before = process.num_threads()
     with tempfile.TemporaryDirectory() as folder, LivePage(port=0, offer=choices.offer(kick)) as page:
-        live = Live(page, choices, USUAL, Path(folder), seed, wished)
+        live = Live(page, choices, USUAL, Path(folder), seed)
         thread = threading.Thread(target=live.serve)
         thread.start()
         until(lambda: page.mode == "planned", 300.0)
@@ -182,7 +184,7 @@ def main(
             jobs[f"drag {index}"] = partial(of_drag, live, target)
             jobs[f"watched {index}"] = partial(of_kick, live, partial(page.ask, "kick"))
             if index < alone:
-                jobs[f"alone {index}"] = partial(headless, live, kick, target, preset, seed)
+                jobs[f"alone {index}"] = partial(headless, live, session, target, preset, seed)
         counted = f"--kicks {kicks} --alone {alone} --clients {clients}"
         command = f"python -m tasks.benchmarks.page {counted} --preset {preset} --seed {seed}"
         rows = dict(zip(jobs, report.collect(json, command, jobs), strict=True))
@@ -221,7 +223,7 @@ def main(
         report.publish("page", "The page", command, table)
 
 
-def headless(live: Live, kick: Kick, target: np.ndarray, preset: PresetName, seed: int) -> report.Row:
+def headless(live: Live, session: Session, target: np.ndarray, preset: PresetName, seed: int) -> report.Row:
     """Return planning times of the same kick in real time without drawing.
 
     The pace is the same as on the page because planning after a pause is slower anyway.
@@ -230,11 +232,11 @@ def headless(live: Live, kick: Kick, target: np.ndarray, preset: PresetName, see
 
     def observe(execution: Execution) -> None:
         nonlocal begun
-        begun = due(begun, kick.scene.dt)
+        begun = due(begun, session.task.scene.dt)
         time.sleep(max(0.0, begun - time.monotonic()))
 
     live.page.panel.playing = False
-    found = kick.to(target, preset, seed=seed, observe=observe).summary
+    found = session.run(target, preset, seed, observe=observe).summary
     live.page.panel.playing = True
     return {"plan_seconds": found["plan_seconds"], "replan_ms": found["replan_ms"]["p50"]}
 

@@ -199,7 +199,7 @@ def cases(kick: Kick, controls: np.ndarray) -> list[Case]:
     scene, base = kick.scene, kick.start()
     base[-1, :2] = 3.0, 0.0
     found: list[Case] = []
-    lower, upper = kick.lower, kick.upper
+    lower, upper = scene.limits
     random = np.random.default_rng(0)
     toss = random.standard_normal((len(base) - 1, 3))
     toss /= np.linalg.norm(toss, axis=-1, keepdims=True)
@@ -582,9 +582,9 @@ def random_scenes(kind: str, model: Simulator, scenes: int, each: int, steps: in
     for _ in range(scenes):
         scene = drawn(kind, random)
         state = wild(scene, each, random)
-        bound = np.array([(motor.lower, motor.upper) for motor in scene.motors]).reshape(-1, 2, 3)
+        lower, upper = scene.limits
         share = random.uniform(0.0, 1.0, (each, steps, len(scene.motors), 3))
-        control = 2.0 * (bound[:, 0] + share * (bound[:, 1] - bound[:, 0]))
+        control = 2.0 * (lower + share * (upper - lower))
         torque = 100.0 * random.standard_normal((each, 1, len(scene.links), 3)) * (random.random((each, 1, 1, 1)) < 0.2)
         torque = np.repeat(torque, steps, axis=1)
         begin = time.monotonic()

@@ -15,9 +15,10 @@ from larp_model.engines.mujoco import Truth
 from larp_model.scene import Scene
 from tasks.benchmarks import report
 from tasks.benchmarks.engines import STEPPED, TRACED
-from tasks.gap import LAUNCH_STEPS, contact_step
-from tasks.kick import Kick
-from tasks.task import LINGER, Planners
+from tasks.gap import LAUNCH_STEPS
+from tasks.presets import PresetName
+from tasks.session import HOLD_STEPS, Session
+from tasks.strike import strike_step
 
 # MuJoCo's limit: engine steps in a step at which it is the reference for all others.
 LIMIT = 160
@@ -70,11 +71,12 @@ def ball_of(states: np.ndarray) -> np.ndarray:
     return np.concatenate([ball[:, packed.POSITION], ball[:, packed.VELOCITY]], axis=-1)
 
 
-def executed(kick: Kick, planners: Planners, target: np.ndarray, seed: int, shift: np.ndarray) -> Kicked:
+def executed(session: Session, preset: PresetName, target: np.ndarray, seed: int, shift: np.ndarray) -> Kicked:
     """Plan a kick and execute it in the ground truth until the ball is away; the reference's joint targets follow."""
-    until = kick.reference.strike + LINGER
-    execution = kick.run(planners, target, seed, kick.start(shift), steps=until)
-    _, after = kick.reference.window(until, AFTER_STRIKE - LINGER)
+    kick = session.task
+    until = kick.reference.strike + HOLD_STEPS
+    execution = session.execute(session.planners(preset), target, seed, kick.start(shift), until)
+    _, after = kick.reference.window(until, AFTER_STRIKE - HOLD_STEPS)
     return Kicked(target, execution.states[0], np.concatenate([np.stack(execution.controls), after]))
 
 
@@ -88,7 +90,7 @@ def astray(scene: Scene, kicked: Kicked, players: dict[Engine, Player]) -> list[
     start, controls = kicked.start[None], kicked.controls[None]
     limit = Truth(scene, 1, LIMIT, threads=1).rollout(start, controls)[0][0]
     states = np.concatenate([start, limit])
-    contact = contact_step(states)
+    contact = strike_step(states, states[:1, -1])
     if contact is None or contact < BEFORE_CONTACT:
         return []
     passing = contact + int(np.linalg.norm(states[contact:, -1, packed.POSITION] - kicked.target, axis=-1).argmin())

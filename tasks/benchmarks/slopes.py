@@ -138,7 +138,8 @@ class Slope:
     def __init__(self, kick: Kick, model: Dynamics) -> None:
         planner = kick.planner(model, (CEM(samples=4, rounds=1, elites=2),))
         window = kick.window(TARGET)(0)
-        controls, context = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), (window.controls, window.context))
+        inputs = window.reference, window.context
+        controls, context = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), inputs)
         start, plan = jnp.asarray(kick.start(), jnp.float32), planner.init(jax.random.key(0))
         self.scale = planner.scale
 

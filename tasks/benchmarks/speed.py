@@ -30,8 +30,8 @@ from tasks.benchmarks.engines import NAMES, PIPELINES, Question, case, titled
 from tasks.command import prepare_jax, run
 from tasks.data import random_task
 from tasks.kick import Kick
-from tasks.models import models_of
-from tasks.presets import preset_of
+from tasks.presets import PresetName
+from tasks.session import Session
 
 # Engine steps in a step, by engine; all of Brax's pipelines have the same.
 SUBSTEPS = {"larp": (1,), "mujoco": (2, 4, 5, 10, 20, 40), "mjx": (20,), "brax": (20,), "bullet": (20,)}
@@ -51,7 +51,7 @@ MIDDLE = 512
 SECONDS = {False: 120.0, True: 300.0}
 # Larger batches are skipped where a step takes longer than this [s].
 SLOW = 0.5
-PRESET = "fast"
+PRESET: PresetName = "fast"
 STYLES = {"spring": "--", "positional": ":"}
 COLOURS = {"larp": "#d55e00", "mujoco": "#0072b2", "mjx": "#009e73", "brax": "#cc79a7", "bullet": "#7f7f7f"}
 
@@ -148,7 +148,7 @@ def price(engine: str, substeps: int, seed: int) -> Question:
 def kicks_of(engines: list[replays.Engine], count: int, seed: int) -> dict[str, partial[report.Row]]:
     """Return the jobs that execute and replay kicks, by name."""
     kick = Kick.standard()
-    planners = kick.planners_of(preset_of(PRESET), models_of(kick.scene, "larp"))
+    session = Session(kick)
     random = np.random.default_rng(seed)
 
     @cache
@@ -160,7 +160,7 @@ def kicks_of(engines: list[replays.Engine], count: int, seed: int) -> dict[str, 
         return found
 
     def one(target: np.ndarray, shift: np.ndarray, index: int) -> report.Row:
-        kicked = replays.executed(kick, planners, target, seed + index, shift)
+        kicked = replays.executed(session, PRESET, target, seed + index, shift)
         return {"target": target.tolist(), "replays": replays.astray(kick.scene, kicked, players())}
 
     return {f"kick {index}": partial(one, *random_task(random), index) for index in range(count)}

@@ -26,9 +26,10 @@ from tasks.benchmarks import pushes, report, slopes
 from tasks.benchmarks.pushes import Bench, refusal, row
 from tasks.benchmarks.report import Row
 from tasks.command import prepare_jax, run
-from tasks.kick import Kick, miss
+from tasks.kick import Kick
 from tasks.models import models_of
-from tasks.task import REACHABLE, checked_target
+from tasks.run import REACHABLE
+from tasks.task import check_target
 
 COLOURS = {True: "#0072b2", False: "#d55e00"}
 SMALL = CEM(samples=8, rounds=2, elites=2)
@@ -67,7 +68,7 @@ def planned(planner: Planner, state: Any = None, reference: Any = None) -> tuple
     """Return a first plan and its info, from the zero state and a zero reference by default."""
     state = np.zeros((1, 13)) if state is None else state
     reference = np.zeros((planner.horizon, 1, 3)) if reference is None else reference
-    return planner.step(planner.init(jax.random.key(0)), state, reference)
+    return planner.step(planner.init(jax.random.key(0)), state, Window(0.0, reference))
 
 
 def small_planners() -> list[Row]:
@@ -81,7 +82,7 @@ def small_planners() -> list[Row]:
         held = whole and expected(plan, info)
         found.append(row("planner", value, promise, seen if whole else "the plan is not finite", held))
 
-    nothing = "the plan carried on, cost inf, 0 candidates finite"
+    nothing = "the warm start, cost inf, 0 candidates finite"
     lost = lambda plan, info: info.cost == np.inf and info.finite == 0 and not np.asarray(plan.knots).any()  # noqa: E731
     good = lambda plan, info: info.cost <= 0.0450001 and info.finite > 0  # noqa: E731
     better = "a finite plan that costs no more than none"
@@ -132,8 +133,8 @@ def small_planners() -> list[Row]:
         ("state of NaN", "state", lambda: planned(coarse, state=np.full((1, 13), np.nan))),
         ("state of 1e39", "state", lambda: planned(coarse, state=np.full((1, 13), 1e39))),
         ("reference of another horizon", "reference", lambda: planned(coarse, reference=np.zeros((5, 1, 3)))),
-        ("target at infinity", "target", lambda: checked_target((np.inf, 0.0, 0.0))),
-        ("target of NaN", "target", lambda: checked_target((0.0, np.nan, 0.0))),
+        ("target at infinity", "target", lambda: check_target((np.inf, 0.0, 0.0))),
+        ("target of NaN", "target", lambda: check_target((0.0, np.nan, 0.0))),
     ):
         with np.errstate(over="ignore"):
             found.append(row("planner", value, "refused by name", *refusal(call, words)))
@@ -160,9 +161,9 @@ def targets(bench: Bench, whole: Any) -> list[Row]:
         ("at infinity", (np.inf, 0.0, 0.0), False),
     ):
         window = kick.window(np.array(target))(0)
-        after, info = planner.step(plan, kick.start(), window.controls, window.context, steps=window.steps)
+        after, info = planner.step(plan, kick.start(), window)
         with np.errstate(all="ignore"):
-            missed = miss(info.states[:, -1, :3], np.array(target)) if np.isfinite(target).all() else np.inf
+            missed = kick.missed(info.states, 1, np.array(target)) if np.isfinite(target).all() else np.inf
         whole_plan = bool(np.isfinite(after.knots).all())
         honest = np.isfinite(info.cost) == (info.finite > 0)
         right = reachable is None or (missed <= REACHABLE) == reachable
@@ -192,13 +193,13 @@ def execution(bench: Bench) -> list[Row]:
             self.count += 1
             return np.full((1, 1, 13), np.nan if self.count == 3 else 0.0)
 
-    def carried_out(every: int, reference: float) -> None:
-        window = Window(np.full((6, 1, 3), reference), None)
-        phase = Phase(still, still, every, lambda step: window)
-        execute(Lost(), np.zeros((1, 13)), (phase,), 5, jax.random.key(0), 0.01)
+    def carried_out(interval: int, reference: float) -> None:
+        controls = np.full((6, 1, 3), reference)
+        phase = Phase(still, still, interval, lambda step: Window(0.01 * step, controls))
+        execute(Lost(), np.zeros((1, 13)), (phase,), 5, jax.random.key(0))
 
-    for value, every in (("lost between two plans", 10), ("lost just before a plan", 3)):
-        seen, held = refusal(partial(carried_out, every, 0.0), "diverged in step 2")
+    for value, interval in (("lost between two plans", 10), ("lost just before a plan", 3)):
+        seen, held = refusal(partial(carried_out, interval, 0.0), "diverged in step 2")
         found.append(row("execution", value, "ends at once and names the step", seen, held))
     truth = Truth(kick.scene, 1, threads=1)
     for name, change in (("torque of 1e9 N m", 1e9), ("torque of NaN", np.nan)):

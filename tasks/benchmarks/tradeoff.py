@@ -15,13 +15,15 @@ from rich.table import Table
 
 from larp_model.engines.mujoco import SUBSTEPS
 from larp_model.errors import InputError
-from mpc import CEM, MPPI, GaussNewton, Gradient, Optimizer, Unless
+from mpc import CEM, MPPI, Fallback, GaussNewton, Gradient, Optimizer
 from tasks.benchmarks import report
 from tasks.command import prepare_jax, run
 from tasks.data import random_task
 from tasks.kick import Kick
-from tasks.models import FLIGHT, models_of
+from tasks.models import FLIGHT, DynamicsName
 from tasks.presets import PRESETS, Preset
+from tasks.run import plans_of, summarize
+from tasks.session import Session
 from tasks.task import BEYOND
 
 # Share by which another point must be better in both error and time to beat a preset.
@@ -39,7 +41,7 @@ class Point:
     """A planner's configuration: a preset, its dynamics, and the engine steps of these where they are MuJoCo."""
 
     preset: Preset
-    dynamics: str = "larp"
+    dynamics: DynamicsName = "larp"
     substeps: int = SUBSTEPS
 
     @property
@@ -49,7 +51,7 @@ class Point:
             return "mujoco"
         if any(self.preset.verify):
             return "verified"
-        stages = (*self.preset.first, *self.preset.again)
+        stages = (*self.preset.first, *self.preset.replan)
         return "gradient" if any(isinstance(each, GaussNewton | Gradient) for each in stages) else "sampling"
 
     @property
@@ -60,9 +62,9 @@ class Point:
         trials = ""
         if any(preset.verify):
             trials = ", trials {} / {} of {} to {:g} mm by {}".format(
-                *preset.verify, preset.candidates, 1e3 * preset.enough, _told((preset.correct,))
+                *preset.verify, preset.candidates, 1e3 * preset.tolerance, _told((preset.correct,))
             )
-        return f"{model}: {_told(preset.first)} / {_told(preset.again)} every {preset.every}{trials}"
+        return f"{model}: {_told(preset.first)} / {_told(preset.replan)} every {preset.interval}{trials}"
 
 
 def _told(stage: Sequence[Optimizer]) -> str:
@@ -82,7 +84,7 @@ def _told(stage: Sequence[Optimizer]) -> str:
             case GaussNewton():
                 slopes = "forward" if each.jacobian == "forward" else f"step {each.step:g}"
                 return f"GN {each.directions}x{each.rounds} {slopes}"
-            case Unless():
+            case Fallback():
                 return f"if astray {_told(each.optimizers)}"
         raise InputError(f"optimizer is {each}, but must be one that has a name here")
 
@@ -103,13 +105,13 @@ def _around() -> Iterator[Point]:
     newton = GaussNewton
     once, twice, few = newton(rounds=1), newton(rounds=2), cem(16, 5, 8)
 
-    def larp(*first: Optimizer, again: Optimizer = once, every: int = 5, **verified: Any) -> Point:
-        return Point(Preset(first, (again,), every, **verified))
+    def larp(*first: Optimizer, replan: Optimizer = once, interval: int = 5, **verified: Any) -> Point:
+        return Point(Preset(first, (replan,), interval, **verified))
 
     # Sampling alone.
     for samples, rounds, elites in ((32, 4, 8), (32, 16, 8), (64, 8, 12), (64, 16, 12), (64, 32, 12), (128, 8, 16)):
-        yield larp(cem(samples, rounds, elites), again=cem(max(2 * elites, samples // 2), max(1, rounds // 3), elites))
-    yield larp(MPPI(samples=64, rounds=16), again=MPPI(samples=32, rounds=5))
+        yield larp(cem(samples, rounds, elites), replan=cem(max(2 * elites, samples // 2), max(1, rounds // 3), elites))
+    yield larp(MPPI(samples=64, rounds=16), replan=MPPI(samples=32, rounds=5))
     # Gauss-Newton: rounds, directions, the step of its differences, forward derivatives.
     for rounds, directions in (
         (1, 24),
@@ -123,48 +125,48 @@ def _around() -> Iterator[Point]:
         (9, 16),
         (12, 32),
     ):
-        yield larp(newton(rounds=rounds, directions=directions), again=newton(rounds=1, directions=directions))
+        yield larp(newton(rounds=rounds, directions=directions), replan=newton(rounds=1, directions=directions))
     for step in (0.005, 0.1, 0.3):
-        yield larp(newton(rounds=12, step=step), again=newton(rounds=1, step=step))
+        yield larp(newton(rounds=12, step=step), replan=newton(rounds=1, step=step))
     for rounds in (6, 12):
         forward = newton(rounds=rounds, jacobian="forward")
-        yield larp(forward, again=newton(rounds=1, jacobian="forward"))
+        yield larp(forward, replan=newton(rounds=1, jacobian="forward"))
     # Steps between replans, and optimisers of replans.
-    for every in (1, 2, 3, 8, 12):
-        yield larp(newton(rounds=6), every=every)
-    for again in (twice, newton(rounds=4), few):
-        yield larp(newton(rounds=6), again=again)
+    for interval in (1, 2, 3, 8, 12):
+        yield larp(newton(rounds=6), interval=interval)
+    for replan in (twice, newton(rounds=4), few):
+        yield larp(newton(rounds=6), replan=replan)
     # After sampling, and other gradients.
     yield larp(cem(32, 4, 8), newton(rounds=4))
     yield larp(cem(32, 8, 8), newton(rounds=6))
-    yield larp(Gradient(steps=16, elites=8), again=Gradient(steps=2, elites=8))
+    yield larp(Gradient(steps=16, elites=8), replan=Gradient(steps=2, elites=8))
     # Trials in the ground truth.
-    for verify, enough in (((2, 1), 0.004), ((4, 1), 0.004), ((8, 1), 0.004), ((8, 3), 0.01), ((8, 3), 0.002)):
-        yield larp(newton(rounds=6), verify=verify, enough=enough)
+    for verify, tolerance in (((2, 1), 0.004), ((4, 1), 0.004), ((8, 1), 0.004), ((8, 3), 0.01), ((8, 3), 0.002)):
+        yield larp(newton(rounds=6), verify=verify, tolerance=tolerance)
     yield larp(newton(rounds=6), verify=(8, 3), candidates=2)
-    yield larp(newton(rounds=6), verify=(8, 3), every=12)
+    yield larp(newton(rounds=6), verify=(8, 3), interval=12)
     rest = cem(32, 2, 12)
-    yield larp(cem(64, 8, 12), again=rest, verify=(2, 2), correct=cem(128, 2, 16), candidates=8, enough=0.0)
+    yield larp(cem(64, 8, 12), replan=rest, verify=(2, 2), correct=cem(128, 2, 16), candidates=8, tolerance=0.0)
     # MuJoCo as the model.
     for substeps in (5, 10, 20):
         for first in (twice, newton(rounds=6)):
-            yield Point(Preset((first,), (once,), every=5), "mujoco", substeps)
+            yield Point(Preset((first,), (once,), interval=5), "mujoco", substeps)
     for substeps in (5, 10):
-        yield Point(Preset((cem(64, 8, 12),), (few,), every=5), "mujoco", substeps)
+        yield Point(Preset((cem(64, 8, 12),), (few,), interval=5), "mujoco", substeps)
 
 
 def measure(kick: Kick, point: Point, weights: Path | None, targets: int, seed: int) -> report.Row:
     """Measure kicks to the first `targets` random targets of a seed, without the standing phase after them."""
-    models = models_of(kick.scene, point.dynamics, weights, substeps=point.substeps)  # type: ignore[arg-type]
-    planners = kick.planners_of(point.preset, models)
+    session = Session(kick, point.dynamics, weights, point.substeps)
+    planners = session.planners(point.preset)
     random, kicks = np.random.default_rng(seed), []
     for index in range(targets):
         target, shift = random_task(random)
         steps = kick.reference.strike + BEYOND + FLIGHT
-        execution = kick.run(planners, target, seed + index, kick.start(shift), steps, stands=False)
-        plans = [replan.info for replan in kick.plans(execution)]
+        execution = session.execute(planners, target, seed + index, kick.start(shift), steps, recovers=False)
+        plans = [plan.info for plan in plans_of(execution)]
         spent = sum(info.seconds for info in plans)
-        kicks.append(kick.report(execution, target) | {"planning_seconds": spent, "first_cost": plans[0].cost})
+        kicks.append(summarize(kick, execution, target) | {"planning_seconds": spent, "first_cost": plans[0].cost})
     jax.clear_caches()  # the next point compiles other programs, and each occupies memory
     errors = np.array([each["truth_error_m"] for each in kicks])
     return {

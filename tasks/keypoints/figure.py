@@ -66,9 +66,7 @@ class Figure:
             for limb, (segment, at) in ON_LIMBS.items():
                 self.anchors[f"{side}_{limb}"] = names.index(f"{side}_{segment}"), at
         self.joints, self.torso = len(self.body.joints), names.index("torso")
-        motors = [motor for _, _, motor in self.body.motors]
-        self.lower = np.array([motor.lower for motor in motors])
-        self.upper = np.array([motor.upper for motor in motors])
+        self.lower, self.upper = self.body.limits
         share = np.zeros((len(PROPORTIONS), len(names), 2))
         for row, (segment, what) in enumerate(PROPORTIONS):
             share[row, [segment_of(name) == segment for name in names], what] = 1.0

@@ -12,7 +12,7 @@ import numpy as np
 
 from larp_model.files import write_whole
 from mpc import Plan, PlanInfo
-from mpc.loop import Begun
+from mpc.loop import Checkpoint
 from tasks.keypoints.camera import Camera
 from tasks.keypoints.figure import Pose
 from tasks.keypoints.lift import Lifted
@@ -50,7 +50,7 @@ class Kept:
     """
 
     lifted: Lifted | None = None
-    begun: Begun | None = None
+    begun: Checkpoint | None = None
     spent: Spent = Spent()
 
     def __init__(self, path: Path, made_by: str) -> None:
@@ -63,7 +63,7 @@ class Kept:
         except Exception:  # numpy and zipfile raise many kinds for a damaged file
             self.lifted, self.begun, self.spent = None, None, Spent()
 
-    def keep(self, lifted: Lifted, begun: Begun | None = None, spent: Spent = Spent()) -> None:  # noqa: B008
+    def keep(self, lifted: Lifted, begun: Checkpoint | None = None, spent: Spent = Spent()) -> None:  # noqa: B008
         """Write the checkpoint."""
         camera = lifted.camera
         content: dict[str, Any] = {
@@ -97,7 +97,7 @@ class Kept:
         if "states" in found:
             elites, spread, start, key = of("plan", Plan._fields)
             plan = Plan(elites, spread, np.float32(start), key)
-            self.begun = Begun(found["states"], found["controls"], plan, int(found["step"]), int(found["phase"]))
+            self.begun = Checkpoint(found["states"], found["controls"], plan, int(found["step"]), int(found["phase"]))
 
 
 def fingerprint(*parts: Any) -> str:

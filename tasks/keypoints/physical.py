@@ -29,7 +29,7 @@ from larp_model.engines.mujoco import Truth, closed
 from larp_model.rotation import matrix
 from larp_model.scene import Body, Scene, anchor
 from mpc import CostTerm, Dynamics, GaussNewton, Optimizer, Planner, Verified, quadratic
-from mpc.loop import Begun, Execution, Phase, Window, execute
+from mpc.loop import Checkpoint, Execution, Phase, Window, execute
 from tasks.data import stray
 from tasks.keypoints.camera import Camera
 from tasks.keypoints.figure import Figure, Pose
@@ -188,10 +188,9 @@ def planner_of(
 
     sigma: standard deviation of the keypoints [px]. truth: see `FitPreset.optimizers`.
     """
-    bounds = np.array([(motor.lower, motor.upper) for motor in scene.motors])
     return Planner(
         dynamics, terms_of(seen, camera, sigma, scene.dt), preset.horizon, preset.knots, scene.dt,
-        SEARCH * stray(scene), preset.optimizers(truth), bounds[:, 0], bounds[:, 1],
+        SEARCH * stray(scene), preset.optimizers(truth), *scene.limits,
     )  # fmt: skip
 
 
@@ -204,12 +203,12 @@ def started(scene: Scene, wanted: WantedMotion) -> np.ndarray:
 
 
 def fit(
-    scene: Scene, planner: Planner, wanted: WantedMotion, state: np.ndarray, every: int, seed: int = 0,
-    observe: Callable[[Execution], None] = lambda execution: None, begun: Begun | None = None,
+    scene: Scene, planner: Planner, wanted: WantedMotion, state: np.ndarray, interval: int, seed: int = 0,
+    observe: Callable[[Execution], None] = lambda execution: None, checkpoint: Checkpoint | None = None,
 ) -> Execution:  # fmt: skip
     """Plan and execute the whole wanted motion in the ground truth, from a state (L, 13); see `mpc.loop.execute`.
 
-    every: steps between plans.
+    interval: steps between plans.
     """
     steps, horizon = len(wanted.states) - 1, planner.horizon
 
@@ -217,7 +216,7 @@ def fit(
         after = np.minimum(step + 1 + np.arange(horizon), steps)
         now = np.minimum(step + np.arange(horizon), steps)
         context = WantedMotion(*(each[after] for each in wanted))._replace(targets=wanted.targets[now])
-        return Window(wanted.targets[now], context)
+        return Window(step * scene.dt, wanted.targets[now], context)
 
-    phase = Phase(planner, planner, every, window)
-    return execute(Truth(scene, 1), state, [phase], steps, jax.random.key(seed), scene.dt, observe, begun=begun)
+    phase = Phase(planner, planner, interval, window)
+    return execute(Truth(scene, 1), state, [phase], steps, jax.random.key(seed), observe, checkpoint=checkpoint)

@@ -37,7 +37,7 @@ def any_episodes(scene: Scene, reference: Reference, count: int, seed: int, step
     states, targets = in_motion(random, scene, reference, sizes, steps)
     noise = smooth_noise(random, count, steps, 8, stray(scene))
     targets += random.uniform(0.0, 1.2, (count, 1, 1, 1)) * noise
-    targets = np.clip(targets, *styles.limits(scene.body("human")))
+    targets = np.clip(targets, *scene.body("human").limits)
     for pair in scene.between.pairs:
         struck = scene.index(pair.second, pair.second_links[0])
         paths = feet(random, scene, states, targets, sizes)
@@ -70,7 +70,7 @@ def in_motion(
         styles.gaits(random, usual, walking, steps, scene.dt),
         styles.moves(random, usual, count - kicking - walking, steps, scene.dt),
     )
-    targets = np.clip(in_detail(human, np.concatenate(performed)), *styles.limits(human))
+    targets = np.clip(in_detail(human, np.concatenate(performed)), *human.limits)
     falling = np.where(random.random((count, 1)) < 0.15, 4.0, 1.0)
     lean = Rotation.from_rotvec(falling * random.standard_normal((count, 3)) * (0.12, 0.15, 0.0))
     states = standing_on_ground(scene, targets[:, 0], lean, sizes)

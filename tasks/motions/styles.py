@@ -21,12 +21,6 @@ def rows_of(body: Body) -> dict[str, int]:
     return {body.links[child].name: row for row, (child, _, _) in enumerate(body.motors)}
 
 
-def limits(body: Body) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and upper bounds of the joint targets, (J, 3) [rad] each."""
-    motors = [motor for _, _, motor in body.motors]
-    return np.array([motor.lower for motor in motors]), np.array([motor.upper for motor in motors])
-
-
 def mirrored(body: Body, targets: np.ndarray) -> np.ndarray:
     """Return the joint targets (*, J, 3) [rad] with left and right exchanged."""
     return targets[..., _opposite(list(rows_of(body))), :] * (-1.0, 1.0, -1.0)
@@ -65,7 +59,7 @@ def kicks(random: np.random.Generator, body: Body, begin: np.ndarray, steps: int
         pace = random.uniform(0.75, 1.3)
         at = np.minimum((first + pace * np.arange(steps)) * dt, times[-1])
         found.append(PchipInterpolator(times, bent)(at))
-    return np.clip(np.array(found), *limits(body))
+    return np.clip(np.array(found), *body.limits)
 
 
 def gaits(random: np.random.Generator, body: Body, count: int, steps: int, dt: float) -> np.ndarray:
@@ -98,7 +92,7 @@ def gaits(random: np.random.Generator, body: Body, count: int, steps: int, dt: f
     found[..., rows["torso"], 1] = any_of(-0.1, 0.4)
     found[..., rows["torso"], 2] = any_of(0.0, 0.3) * np.sin(turn)
     found += any_of(0.0, 0.5)[..., None, None] * spreads(body) * random.standard_normal((count, 1, len(rows), 3))
-    return np.clip(found, *limits(body))
+    return np.clip(found, *body.limits)
 
 
 def moves(random: np.random.Generator, body: Body, count: int, steps: int, dt: float) -> np.ndarray:
@@ -119,11 +113,11 @@ def moves(random: np.random.Generator, body: Body, count: int, steps: int, dt: f
     at = np.clip(times / pause, 0.0, knots - 1.0)
     knot = np.arange(knots)
     found = [CubicSpline(knot, own, bc_type="clamped")(when) for own, when in zip(poses, at, strict=True)]
-    return np.clip(np.reshape(found, (count, steps, len(rows), 3)), *limits(body))
+    return np.clip(np.reshape(found, (count, steps, len(rows), 3)), *body.limits)
 
 
 def spreads(body: Body) -> np.ndarray:
     """Return the standard deviation (J, 3) [rad] by which angles differ from motion to motion."""
-    lower, upper = limits(body)
+    lower, upper = body.limits
     usual = [STRAY[segment_of(body.links[child].name)] for child, _, _ in body.motors]
     return np.minimum(1.5 * np.array(usual)[:, None], 0.2 * (upper - lower))

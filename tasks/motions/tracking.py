@@ -42,8 +42,7 @@ class Tracker:
             wanted, weights = context
             return (weights * (states[..., packed.POSITION] - wanted)).reshape(len(states), -1)
 
-        bounds = np.array([(motor.lower, motor.upper) for motor in scene.motors])
-        lower, upper = bounds[:, 0], bounds[:, 1]
+        lower, upper = scene.limits
         self.planner = Planner(
             MujocoDynamics(Truth(scene, ROWS, SUBSTEPS)), [CostTerm("apart", apart, quadratic)], HORIZON, KNOTS,
             scene.dt, SPREAD * (upper - lower), OPTIMIZER, lower, upper,
@@ -57,13 +56,14 @@ class Tracker:
 
         def window(step: int) -> Window:
             rows = np.minimum(begin + step + np.arange(HORIZON + 1), len(self.wanted) - 1)
-            return Window(self.controls[rows[:-1]], (self.wanted[rows[1:]], self.weights[rows[1:]]))
+            context = self.wanted[rows[1:]], self.weights[rows[1:]]
+            return Window(step * self.scene.dt, self.controls[rows[:-1]], context)
 
         def lost(step: int, current: np.ndarray) -> bool:
             return not np.isfinite(current).all()
 
         execution = execute(
             Truth(self.scene), state, [Phase(self.planner, self.planner, EVERY, window, lost)],
-            end - begin, jax.random.key(0), self.scene.dt,
+            end - begin, jax.random.key(0),
         )  # fmt: skip
         return np.array(execution.states), np.array(execution.controls)

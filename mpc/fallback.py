@@ -1,33 +1,35 @@
-"""Optimisers that run only where the plan is not good enough yet."""
+"""Optimisers that run only where the search has not converged."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from larp_model.errors import InputError
-from mpc.search import Enough, Optimizer, Problem, Search, require_enough, suffices
+from mpc.search import Optimizer, Problem, Search, Tolerance, converged, require_tolerance
 
 
 @dataclass(frozen=True)
-class Unless:
-    """A fallback: these optimisers, one after the other, unless the best candidate's residuals are short `enough`.
+class Fallback:
+    """Run these optimisers, one after the other, unless the best candidate's residuals are within `tolerance`.
 
-    A way out of where descent got stuck, for the price of one candidate everywhere else.
+    A way out of local minima, for the price of one candidate everywhere else.
     """
 
-    enough: Enough
-    """Residuals by name, and the length that each may have."""
+    tolerance: Tolerance
     optimizers: tuple[Optimizer, ...]
 
     def __post_init__(self) -> None:
-        require_enough(self.enough)
-        if not (self.enough and self.optimizers):
-            raise InputError(f"enough, optimizers: got {self.enough}, {self.optimizers}, needs some of both")
+        require_tolerance(self.tolerance)
+        if not (self.tolerance and self.optimizers):
+            raise InputError(f"tolerance, optimizers: got {self.tolerance}, {self.optimizers}, needs some of both")
         for each in self.optimizers:
-            if getattr(each, "settles", False):
+            if each.terminal:
                 raise InputError(f"optimizers: got {type(each).__name__}, which must come last of all")
+
+    terminal: ClassVar[bool] = False
 
     @property
     def differentiates(self) -> bool:
@@ -41,8 +43,8 @@ class Unless:
 
     def improve(self, search: Search, random: np.random.Generator, problem: Problem) -> Search:
         """Return the search as it is, or after all rounds of all optimisers."""
-        best = problem.tries(search.elites[:1])
-        if suffices(self.enough, float(best.costs[0]), best.residuals):
+        best = problem.evaluate(search.elites[:1])
+        if converged(self.tolerance, float(best.costs[0]), best.residuals):
             return search
         for each in self.optimizers:
             search = each.improve(search, random, problem)

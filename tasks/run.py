@@ -1,0 +1,227 @@
+"""Runs: the result of a task that was planned and executed, its figures, its files and its page."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+
+from larp_model import state as packed
+from larp_model.engines.mujoco import FINE_SUBSTEPS, Truth
+from larp_model.files import require_writable, write_whole
+from mpc.loop import Execution, PlanRecord
+from tasks.gap import described, gap
+from tasks.strike import strike_step
+from tasks.task import Task
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from viewer import LivePage, Recording
+
+# Steps after contact up to which the miss and a fall are measured.
+AFTER_CONTACT = 200
+# A goal is reachable if a plan comes so near to it [m].
+REACHABLE = 0.25
+
+
+def plans_of(execution: Execution) -> list[PlanRecord]:
+    """Return the plans of the task itself, without those of the recovery."""
+    return [plan for plan in execution.plans if plan.phase == 0]
+
+
+def measured(contact: int | None, count: int) -> tuple[int, int]:
+    """Return the range of `count` states in which the miss is measured: from first contact, if any, to 2 s after it."""
+    return (0, count) if contact is None else (max(contact - 1, 0), min(contact + AFTER_CONTACT + 1, count))
+
+
+def summarize(task: Task, execution: Execution, goal: Any) -> dict[str, Any]:
+    """Return the figures of an execution, entries of `summary.json`; the README explains each."""
+    states, plans = np.stack(execution.states), plans_of(execution)
+    free = task.untouched(states[0], len(states) - 1)
+    begin, end = measured(strike_step(states, free), len(states))
+    last = plans[-1]
+    truth_error = task.missed(states[begin:end], begin, goal)
+    model_error = task.missed(last.info.states, last.step + 1, goal)
+    links = states[: begin + 1, task.human, packed.POSITION]
+    reference = task.reference.states[: begin + 1, task.human, packed.POSITION]
+    deviation = np.linalg.norm((links - links[:, :1]) - (reference - reference[:, :1]), axis=-1)
+    seconds = [plan.info.seconds for plan in plans]
+    replan_ms = 1e3 * np.array(seconds[1:] or seconds)
+    return {
+        "target": jax.tree.map(lambda leaf: np.asarray(leaf, float).tolist(), goal),
+        "truth_error_m": truth_error,
+        "limit_error_m": truth_error if task.substeps == FINE_SUBSTEPS else replayed(task, execution, goal),
+        "model_error_m": model_error,
+        "metrics": task.metrics(states[begin:end], goal),
+        "ball_speed_m_s": float(np.linalg.norm(states[begin:end, task.ball, packed.VELOCITY], axis=-1).max()),
+        "touched": strike_step(states, free) is not None,
+        "reachable": model_error <= REACHABLE,
+        "gap": gap(task.scene, states, np.concatenate([last.state[None], last.info.states]), last.step, free),
+        "reference_deviation_m": float(deviation.mean()),
+        "fell": bool((states[:end, 0, 2] < 0.5 * task.standing_height).any()),
+        "plan_seconds": float(seconds[0]),
+        "replan_ms": {"p50": float(np.quantile(replan_ms, 0.5)), "p99": float(np.quantile(replan_ms, 0.99))},
+        "compile_seconds": float(sum(plan.info.compile_seconds for plan in execution.plans)),
+        "candidates_lost": sum(plan.info.candidates - plan.info.finite for plan in execution.plans),
+        "truth_rollouts": sum(plan.info.verified for plan in plans),
+    }
+
+
+def replayed(task: Task, execution: Execution, goal: Any, substeps: int = FINE_SUBSTEPS) -> float:
+    """Return the miss [m] of the executed controls, replayed from the start in the ground truth.
+
+    substeps: engine steps in a step of the replay.
+    """
+    start, controls = execution.states[0], np.stack(execution.controls)
+    after, _ = Truth(task.scene, 1, substeps, threads=1).rollout(start[None], controls[None])
+    states = np.concatenate([start[None], after[0]])
+    begin, end = measured(strike_step(states, task.untouched(start, len(controls))), len(states))
+    return task.missed(states[begin:end], begin, goal)
+
+
+def facts(task: Task, summary: dict[str, Any]) -> dict[str, str]:
+    """Return a task's summary for display: labels, and values with their units."""
+    lines = {
+        "the model expected": f"{100 * summary['model_error_m']:.1f} cm",
+        "ball speed": f"{summary['ball_speed_m_s']:.1f} m/s",
+        "distance from the reference": f"{100 * summary['reference_deviation_m']:.1f} cm",
+        "planned with": f"{summary['dynamics']}, {summary['preset']}",
+        **{name: f"{value:.2f}" for name, value in summary["metrics"].items()},
+        **described(summary["gap"]),
+    }
+    if summary["fell"]:
+        lines["fell"] = "yes"
+    if not summary["reachable"]:
+        lines["reachable"] = "no: this plan comes nearest"
+    return lines
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """Result of a task that was planned and executed in the ground truth.
+
+    summary: the content of `summary.json`; see the README for each entry.
+    """
+
+    task: Task
+    execution: Execution
+    goal: Any
+    summary: dict[str, Any]
+
+    @classmethod
+    def of(cls, task: Task, execution: Execution, goal: Any, **labels: Any) -> Run:
+        """Return the run of an execution for a goal; labels: further entries of the summary, such as the preset."""
+        return cls(task, execution, goal, summarize(task, execution, goal) | labels)
+
+    @property
+    def states(self) -> np.ndarray:
+        """Return the executed states (T + 1, L, 13)."""
+        return np.stack(self.execution.states)
+
+    @property
+    def joint_targets(self) -> np.ndarray:
+        """Return the executed joint targets of the motors (T, J, 3) [rad]."""
+        return np.stack(self.execution.controls)
+
+    @property
+    def plans(self) -> list[PlanRecord]:
+        """Return the plans of the task itself, without those of the recovery."""
+        return plans_of(self.execution)
+
+    @property
+    def predicted(self) -> np.ndarray:
+        """Return the states (T', L, 13) that the last plan predicted, from the state that it began in."""
+        last = self.plans[-1]
+        return np.concatenate([last.state[None], last.info.states])
+
+    @property
+    def truth_error_m(self) -> float:
+        """Return by how much the target was missed, in the ground truth [m]."""
+        return float(self.summary["truth_error_m"])
+
+    @property
+    def model_error_m(self) -> float:
+        """Return by how much the last plan expected to miss the target [m]."""
+        return float(self.summary["model_error_m"])
+
+    @property
+    def costs(self) -> dict[str, list[float]]:
+        """Return each term's share of the cost, plan by plan."""
+        return {term: [plan.info.terms[term] for plan in self.plans] for term in self.plans[-1].info.terms}
+
+    @property
+    def recording(self) -> Recording:
+        """Return the recording for the viewer: ground truth, the last plan's prediction, reference."""
+        from viewer import Recording
+
+        task, states = self.task, self.states
+        return Recording(
+            task.scene,
+            states,
+            task.marker(self.goal),
+            self.predicted,
+            self.plans[-1].step,
+            task.reference.states[: len(states)],
+            task.title(self.goal),
+            facts(task, self.summary),
+        )
+
+    @property
+    def table(self) -> Table:
+        """Return the result as a table for display."""
+        from rich.table import Table
+
+        replan = self.summary["replan_ms"]["p50"]
+        lines = {
+            "missed by, in MuJoCo": f"{100 * self.truth_error_m:.1f} cm",
+            **facts(self.task, self.summary),
+            "first plan, each replan": f"{self.summary['plan_seconds']:.2f} s, {replan:.0f} ms",
+        }
+        table = Table("", "", title=self.task.title(self.goal), show_header=False)
+        for label, value in lines.items():
+            table.add_row(label, value)
+        return table
+
+    def save(self, folder: str | Path) -> Path:
+        """Write `NAME.npz`, `.png`, `.html` and, last, `summary.json`, each whole or not at all; returns the folder.
+
+        NAME is the task's; the npz holds states, joint_targets, plan_knots, plan_step and predicted_states.
+        """
+        from viewer import kick_picture, write_html
+
+        folder, name, recording, last = Path(folder), self.task.name, self.recording, self.plans[-1]
+        require_writable(folder, "folder")
+        buffer = io.BytesIO()
+        np.savez_compressed(
+            buffer,
+            states=recording.states.astype(np.float32),
+            joint_targets=self.joint_targets.astype(np.float32),
+            plan_knots=np.asarray(last.plan.knots),
+            plan_step=last.step,
+            predicted_states=last.info.states,
+        )
+        write_whole(folder / f"{name}.npz", buffer.getvalue())
+        kick_picture(recording, self.costs, folder / f"{name}.png")
+        write_html(recording, folder / f"{name}.html")
+        write_whole(folder / "summary.json", (json.dumps(self.summary, indent=2) + "\n").encode())
+        return folder
+
+    def _repr_html_(self) -> str:
+        """Return the replay as HTML, which a notebook shows for the run."""
+        from viewer import framed
+
+        return framed(self.recording)
+
+    def show(self, host: str = "127.0.0.1", port: int = 0) -> LivePage:
+        """Open a page that plays the run, at its `address`, until it is closed; port 0 takes a free one."""
+        from viewer import LivePage
+
+        page = LivePage(host, port)
+        page.finish(self.recording)
+        return page
