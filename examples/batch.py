@@ -12,9 +12,9 @@ import numpy as np
 from rich.progress import track
 
 from larp_model.files import written_whole
-from tasks.data import random_task
 from tasks.kick import Kick
 from tasks.session import Session
+from tasks.targets import random_kick
 
 Row = tuple[np.ndarray, np.ndarray, np.ndarray, float, bool]
 
@@ -23,7 +23,7 @@ def kicks(session: Session, numbers: np.ndarray, seed: int) -> list[Row]:
     """Return kicks to random targets, with the ball's place moved a little each time; compiled once."""
     rows = []
     for number in track(numbers.tolist(), "kicks"):
-        target, offset = random_task(np.random.default_rng((seed, number)))
+        target, offset = random_kick(np.random.default_rng((seed, number)))
         run = session.run(target, "fast", number, session.task.start(offset))
         rows.append((target, run.states, run.joint_targets, run.truth_error_m, run.summary["fell"]))
     return rows

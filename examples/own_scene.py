@@ -12,8 +12,8 @@ import numpy as np
 
 from larp_model import Pair, Scene, Simulator, Surface, ball, capsule
 from tasks import train
+from tasks.episodes.chains import thrown_episodes
 from tasks.scenarios import Scenario
-from tasks.thrown import thrown_episodes
 
 CLUB, BALL = capsule("club", length=0.6, radius=0.04, mass=0.8), ball()
 CONTACT = Pair("club", "ball", ("capsule",), ("ball",), Surface(4000.0, 120.0, 1.0))

@@ -27,7 +27,7 @@ def adapt() -> None:
 
 def pose() -> None:
     """Run `larp-pose`: motion from keypoints."""
-    _start("tasks.pose")
+    _start("tasks.pose.command")
 
 
 def bench() -> None:

@@ -29,11 +29,12 @@ from larp_model.names import require_file
 from larp_model.networks import Weights
 from larp_model.simulator import Simulator
 from tasks.command import prepare_jax, run
-from tasks.data import WINDOWS, random_episodes
+from tasks.episodes.around_kick import random_episodes
+from tasks.episodes.candidates import tried_episodes
 from tasks.kick import Kick
+from tasks.scenarios import WINDOWS
 from tasks.task import HEIGHT
 from tasks.train import OVER_PHYSICS
-from tasks.tried import tried_episodes
 
 # Episodes that weights are checked on, and those drawn at a time.
 HELD_OUT, DRAWN = 64, 256

@@ -27,10 +27,11 @@ from larp_model.errors import InputError
 from larp_model.files import write_whole
 from larp_model.scene import Scene
 from tasks.command import run
-from tasks.data import SHIFT, smooth_noise, stray
+from tasks.exploration import exploration_std, smooth_noise
 from tasks.motions import key_poses
 from tasks.motions.key_poses import KeyPoses
 from tasks.motions.references import starts
+from tasks.targets import SHIFT
 
 # Aims of a kick: launch and toe speed [m/s], elevation of the launch [rad], earliest and latest step of the
 # strike, clearance of the toes before it [m], and how long it is watched [steps].
@@ -133,7 +134,7 @@ def disturbances(random: np.random.Generator, scene: Scene, kicks: int, size: fl
     """
     shift = size * random.uniform(-SHIFT, SHIFT, (kicks, 2))
     noise = np.zeros((kicks, WATCHED, len(scene.motors), 3))
-    noise[:, : STRIKE[1]] = smooth_noise(random, kicks, STRIKE[1], 7, 0.5 * size * stray(scene))
+    noise[:, : STRIKE[1]] = smooth_noise(random, kicks, STRIKE[1], 7, 0.5 * size * exploration_std(scene))
     shift[0], noise[0] = 0.0, 0.0
     return shift, noise
 

@@ -15,12 +15,13 @@ from larp_model.engines.episodes import Episodes
 from larp_model.errors import InputError
 from larp_model.names import require_file, require_known
 from larp_model.scene import Scene
-from tasks.data import WINDOWS, random_episodes
+from tasks.episodes.any_motion import any_episodes
+from tasks.episodes.around_kick import random_episodes
+from tasks.episodes.chains import thrown_episodes
 from tasks.motions import references
-from tasks.motions.generator import any_episodes
-from tasks.thrown import thrown_episodes
 
-CHAIN_WINDOWS = (10, 40, 80, 190)
+# The first n steps over which errors are averaged, as in the paper.
+WINDOWS, CHAIN_WINDOWS = (10, 38, 60), (10, 40, 80, 190)
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from larp_model.bodies import standing_height
 from larp_model.scene import Scene
 from mpc import CostTerm, Dynamics, Optimizer, Planner, Window, quadratic
 from tasks import residuals
-from tasks.data import stray
+from tasks.exploration import exploration_std
 from tasks.motions.references import Reference
 from tasks.presets import usable
 
@@ -121,7 +121,7 @@ class Standing:
             HORIZON,
             KNOTS,
             self.scene.dt,
-            SEARCH * stray(self.scene),
+            SEARCH * exploration_std(self.scene),
             usable(dynamics, optimizers),
             *self.scene.limits,
         )

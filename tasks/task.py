@@ -31,7 +31,7 @@ from larp_model.errors import InputError
 from larp_model.scene import Scene
 from mpc import CostTerm, Dynamics, Optimizer, Planner, Window, l2, quadratic
 from tasks import residuals, strike
-from tasks.data import stray
+from tasks.exploration import exploration_std
 from tasks.models import FLIGHT
 from tasks.motions import references
 from tasks.motions.bvh import names_in
@@ -226,7 +226,7 @@ class Task(ABC):
             self.horizon,
             KNOTS,
             self.scene.dt,
-            SEARCH * stray(self.scene),
+            SEARCH * exploration_std(self.scene),
             usable(dynamics, optimizers),
             *self.scene.limits,
         )

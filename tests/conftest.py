@@ -20,7 +20,7 @@ from larp_model.runtime import remember_compilations
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from larp_model.training import Recipe, Windows, statistics_of
-from tasks.data import random_episodes
+from tasks.episodes.around_kick import random_episodes
 from tasks.motions.references import Reference, embedded
 
 # The first example of a property pays for compilation: no deadline. Every run tries the same examples.

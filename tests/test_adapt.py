@@ -16,7 +16,7 @@ from larp_model.learned.model import Model
 from larp_model.networks import Weights
 from tasks import adapt
 from tasks.adapt import Checked
-from tasks.data import random_episodes
+from tasks.episodes.around_kick import random_episodes
 from tasks.kick import Kick
 
 

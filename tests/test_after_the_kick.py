@@ -12,11 +12,11 @@ from larp_model import state as packed
 from larp_model.physics import kinematics
 from mpc import evaluate
 from tasks import kick, sensing
-from tasks.data import random_roll
 from tasks.gap import events, gap
 from tasks.motions.references import standing_on_ground
 from tasks.standing import HORIZON, SWUNG, Standing
 from tasks.strike import strike_step
+from tasks.targets import random_roll
 
 
 @pytest.fixture(scope="module")

@@ -18,11 +18,11 @@ from scipy.spatial.transform import Rotation
 
 from larp_model.errors import InputError
 from tasks.benchmarks import pose as benchmark
-from tasks.keypoints import aist, arrays, lift, metrics
-from tasks.keypoints import figure as figures
-from tasks.keypoints.camera import Camera, looking
-from tasks.keypoints.figure import SHARED
-from tasks.keypoints.points import POINTS, Keypoints
+from tasks.pose import aist, lift, metrics, safe_pickle
+from tasks.pose import figure as figures
+from tasks.pose.camera import Camera, looking
+from tasks.pose.figure import SHARED
+from tasks.pose.points import POINTS, Keypoints
 
 PROTOCOLS = (2, 3, 4, 5)
 SEQUENCE, VIDEO, OTHER = "gBR_sBM_cAll_d06_mBR4_ch06", "gBR_sBM_c06_d06_mBR4_ch06", "gLH_sFM_cAll_d18_mLH0_ch15"
@@ -124,7 +124,7 @@ ARRAYS: dict[str, Any] = {
 def test_arrays_come_back_exactly(protocol: int, tmp_path: Path) -> None:
     path = tmp_path / "arrays.pkl"
     path.write_bytes(dumps(ARRAYS | {"again": ARRAYS["floats"]}, protocol))
-    found = arrays.load(path)
+    found = safe_pickle.load(path)
     assert list(found) == [*ARRAYS, "again"]
     for name, expected in ARRAYS.items():
         assert found[name].dtype == expected.dtype
@@ -140,7 +140,7 @@ def test_plain_values_come_back_exactly(protocol: int, tmp_path: Path) -> None:
     }
     held |= {"text\né": {"": {"": ""}}, "bytes": [b"", b"\x00\xff"], "long": list(range(3000))}
     (tmp_path / "values.pkl").write_bytes(dumps(held, protocol))
-    assert arrays.load(tmp_path / "values.pkl") == held
+    assert safe_pickle.load(tmp_path / "values.pkl") == held
 
 
 class Trap:
@@ -156,7 +156,7 @@ class Trap:
 def refused(path: Path, content: bytes, said: str) -> None:
     path.write_bytes(content)
     with pytest.raises(InputError, match=said) as error:
-        arrays.load(path)
+        safe_pickle.load(path)
     assert "\n" not in str(error.value) and str(error.value).startswith(path.name)
 
 
@@ -224,7 +224,7 @@ def test_no_damage_to_a_pickle_fails_but_with_a_refusal_in_one_line(
     path = tmp_path_factory.getbasetemp() / "damaged.pkl"
     path.write_bytes(content)
     try:
-        arrays.load(path)
+        safe_pickle.load(path)
     except InputError as error:
         assert "\n" not in str(error) and str(error).startswith("damaged.pkl")
 
@@ -275,7 +275,7 @@ def test_sequences_that_aist_found_faulty_are_left_out(kick: np.ndarray, tmp_pat
 def kept(folder: Path, name: str, **changed: Any) -> None:
     """Write a pickle of the folder again, other than it was."""
     path = folder / name / f"{SEQUENCE}.pkl"
-    path.write_bytes(dumps(arrays.load(path) | changed, 4))
+    path.write_bytes(dumps(safe_pickle.load(path) | changed, 4))
 
 
 def lens_with(folder: Path, **changed: Any) -> None:

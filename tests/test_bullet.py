@@ -17,9 +17,9 @@ from larp_model.engines.mujoco import Truth, compile_model
 from larp_model.errors import InputError
 from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface
 from tasks.benchmarks.model import second_opinion
-from tasks.data import smooth_noise, stray
+from tasks.episodes.chains import thrown_episodes
+from tasks.exploration import exploration_std, smooth_noise
 from tasks.motions.references import Reference, standing_on_ground
-from tasks.thrown import thrown_episodes
 
 MISSING = "pybullet is not installed: pip install 'larp-mpc[bullet]'"
 
@@ -53,7 +53,7 @@ def same_sign(states: np.ndarray) -> np.ndarray:
 def kicks(scene: Scene, reference: Reference, count: int, steps: int) -> tuple[np.ndarray, np.ndarray]:
     """Starts (count, L, 13) and joint targets (count, steps, J, 3) of kicks around the reference."""
     controls = reference.window(0, steps)[1]
-    strayed = smooth_noise(np.random.default_rng(0), count, steps, 6, stray(scene))
+    strayed = smooth_noise(np.random.default_rng(0), count, steps, 6, exploration_std(scene))
     return np.tile(reference.states[0], (count, 1, 1)), controls + 0.3 * strayed
 
 

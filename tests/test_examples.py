@@ -69,4 +69,4 @@ def test_every_example_is_run() -> None:
 
 def test_examples_are_short() -> None:
     for path in EXAMPLES.glob("*.py"):
-        assert len(path.read_text().splitlines()) <= (120 if path.stem == "pass_to_runner" else 60), path.name
+        assert len(path.read_text().splitlines()) <= (90 if path.stem == "pass_to_runner" else 60), path.name

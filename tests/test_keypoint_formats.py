@@ -16,8 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from larp_model.errors import InputError
-from tasks.keypoints import formats
-from tasks.keypoints.points import POINTS, Keypoints
+from tasks.pose import formats
+from tasks.pose.points import POINTS, Keypoints
 
 RATE = 30.0
 SIZE = (1280.0, 720.0)

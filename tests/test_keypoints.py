@@ -16,13 +16,13 @@ from larp_model.bodies import human_and_ball
 from larp_model.engines.mujoco import closed
 from larp_model.errors import InputError
 from larp_model.scene import Scene
-from tasks.keypoints import camera as cameras
-from tasks.keypoints import figure as figures
-from tasks.keypoints import filmed, lift, metrics, physical
-from tasks.keypoints.banded import Banded
-from tasks.keypoints.figure import SHARED, Figure, Pose
-from tasks.keypoints.points import POINTS, Keypoints
 from tasks.motions.references import embedded
+from tasks.pose import camera as cameras
+from tasks.pose import figure as figures
+from tasks.pose import lift, metrics, physical, synthetic_film
+from tasks.pose.banded import Banded
+from tasks.pose.figure import SHARED, Figure, Pose
+from tasks.pose.points import POINTS, Keypoints
 
 SIZE = (1000.0, 800.0)
 seeds = st.integers(0, 2**31)
@@ -43,10 +43,12 @@ def kick() -> np.ndarray:
     return np.asarray(points.points(states.astype(np.float32)), float)
 
 
-def film_of(points: np.ndarray, seed: int, noise: filmed.Noise = filmed.USUAL) -> tuple[Keypoints, cameras.Camera]:
+def film_of(
+    points: np.ndarray, seed: int, noise: synthetic_film.Noise = synthetic_film.USUAL
+) -> tuple[Keypoints, cameras.Camera]:
     random = np.random.default_rng(seed)
-    lens = filmed.camera_around(random, points)
-    return filmed.seen(random, lens, points, 50.0, noise), lens
+    lens = synthetic_film.camera_around(random, points)
+    return synthetic_film.seen(random, lens, points, 50.0, noise), lens
 
 
 class TestCamera:
@@ -207,12 +209,12 @@ class TestEquations:
 
 class TestFilms:
     def test_without_noise_a_film_shows_where_points_are(self, kick: np.ndarray) -> None:
-        film, lens = film_of(kick, 5, filmed.Noise(0.0, 0.0, 0.0))
+        film, lens = film_of(kick, 5, synthetic_film.Noise(0.0, 0.0, 0.0))
         np.testing.assert_allclose(film.places, lens.project(kick))
-        assert film.seen.all() and (film.places > 0.0).all() and (film.places < filmed.SIZE[0]).all()
+        assert film.seen.all() and (film.places > 0.0).all() and (film.places < synthetic_film.SIZE[0]).all()
 
     def test_what_is_missed_has_no_confidence(self, kick: np.ndarray) -> None:
-        film, _ = film_of(kick, 5, filmed.Noise(4.0, 0.3, 0.1))
+        film, _ = film_of(kick, 5, synthetic_film.Noise(4.0, 0.3, 0.1))
         assert (np.isnan(film.places[..., 0]) == ~film.seen).all() and 0.1 < (~film.seen).mean() < 0.9
 
     def test_a_figure_laid_over_a_kick_is_near_the_true_one(self, kick: np.ndarray) -> None:
@@ -226,7 +228,7 @@ class TestFilms:
     def test_a_person_of_known_height_is_as_large_and_as_far_whatever_the_image(self, kick: np.ndarray) -> None:
         small = 1.6 / 1.75 * kick
         film, lens = film_of(small, 17)
-        lifted = lift.lift(film, cameras.held(lens.focal, filmed.SIZE), known=False, height=1.6)
+        lifted = lift.lift(film, cameras.held(lens.focal, synthetic_film.SIZE), known=False, height=1.6)
         found = figures.figure().all_points(lifted.pose, lifted.proportions)
         far, true = (
             np.linalg.norm(metrics.pelvis(points)[:, 0] - np.asarray(by.position), axis=1).mean()
@@ -250,7 +252,7 @@ class TestFilms:
 
     def test_a_camera_of_which_only_the_lens_is_known_is_found_with_the_motion(self, kick: np.ndarray) -> None:
         film, lens = film_of(kick, 13)
-        lifted = lift.lift(film, cameras.held(lens.focal, filmed.SIZE), known=False)
+        lifted = lift.lift(film, cameras.held(lens.focal, synthetic_film.SIZE), known=False)
         found = figures.figure().all_points(lifted.pose, lifted.proportions)
         errors = metrics.position_errors(found, kick)
         tilt, found_tilt = (float(np.arcsin(-np.asarray(each.turn)[2, 2])) for each in (lens, lifted.camera))

@@ -20,11 +20,11 @@ from larp_model.errors import InputError
 from mpc import CEM
 from tasks import kick
 from tasks.command import Teller, run
-from tasks.data import random_task
 from tasks.motions import references
 from tasks.presets import PRESETS, Preset
 from tasks.run import replayed, summarize
 from tasks.session import Session
+from tasks.targets import random_kick
 
 PROTOCOL = {
     "target",
@@ -91,7 +91,7 @@ def test_the_ball_distance_counts_the_way_between_steps(task: kick.Kick) -> None
 def test_tasks_are_drawn_within_the_protocols_bounds() -> None:
     random = np.random.default_rng(0)
     for _ in range(200):
-        target, shift = random_task(random)
+        target, shift = random_kick(random)
         assert 2.0 <= np.hypot(*target[:2]) <= 5.0
         assert abs(np.degrees(np.arctan2(target[1], target[0]))) <= 25.0
         assert 0.11 <= target[2] <= 1.0
@@ -101,7 +101,7 @@ def test_tasks_are_drawn_within_the_protocols_bounds() -> None:
 def test_fast_hits_its_targets_and_stays_near_the_reference(task: kick.Kick) -> None:
     session, random, reports = Session(task), np.random.default_rng(5), []
     for seed in range(3):
-        target, shift = random_task(random)
+        target, shift = random_kick(random)
         execution = session.execute(session.planners("fast"), target, seed, task.start(shift), recovers=False)
         reports.append(summarize(task, execution, target))
     assert np.mean([report["truth_error_m"] for report in reports]) <= 0.08

@@ -20,9 +20,9 @@ from larp_model.engines.mujoco import Truth, closed, compile_model
 from larp_model.physics import kinematics
 from larp_model.physics.motion import GAMMA, BodyMotion, Constants, articulated_motion, moments
 from larp_model.scene import Body, Scene
+from tasks.episodes.chains import thrown_episodes, thrown_starts
 from tasks.motions.references import standing_on_ground
 from tasks.scenarios import scenario
-from tasks.thrown import thrown_episodes, thrown_starts
 
 BODIES = (capsule(), chain(links=2), chain(links=4), human())
 FULL = human(detail="full")

@@ -14,10 +14,10 @@ from larp_model.detection import first_contacts
 from larp_model.engines.mujoco import Truth
 from larp_model.physics import kinematics
 from larp_model.scene import Body
+from tasks.episodes.any_motion import any_episodes, in_motion, planted
+from tasks.episodes.people import BUILD, HEIGHT, MASS, VARIED, random_people
 from tasks.motions import references, styles
 from tasks.motions.details import in_detail
-from tasks.motions.generator import any_episodes, in_motion, planted
-from tasks.motions.people import BUILD, HEIGHT, MASS, VARIED, random_people
 from tasks.motions.references import clearance
 
 SCENE = human_and_ball()

@@ -20,7 +20,7 @@ from larp_model.engines.mujoco import SUBSTEPS, Truth, compile_model
 from larp_model.errors import InputError
 from larp_model.physics import kinematics
 from larp_model.scene import Scene
-from tasks.data import smooth_noise, stray
+from tasks.exploration import exploration_std, smooth_noise
 from tasks.motions.references import Reference, standing_on_ground
 
 
@@ -44,7 +44,7 @@ def kicks(scene: Scene, reference: Reference, count: int, steps: int, seed: int)
     states = np.tile(reference.states[0], (count, 1, 1))
     states[:, -1, :2] += random.uniform(-0.03, 0.03, (count, 2))
     controls = reference.window(0, steps)[1]
-    return states, controls + 0.4 * smooth_noise(random, count, steps, 6, stray(scene))
+    return states, controls + 0.4 * smooth_noise(random, count, steps, 6, exploration_std(scene))
 
 
 def test_free_fall_is_exact() -> None:

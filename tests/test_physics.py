@@ -27,7 +27,7 @@ from larp_model.physics.response import Gains, responses
 from larp_model.scene import Body, Pair, Scene
 from larp_model.simulator import Simulator
 from larp_model.simulator import step as simulator_step
-from tasks.data import random_episodes
+from tasks.episodes.around_kick import random_episodes
 from tasks.motions.references import Reference
 
 FRICTION = 0.7

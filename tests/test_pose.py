@@ -15,16 +15,15 @@ from larp_model.engines.mujoco import Truth
 from larp_model.errors import InputError
 from mpc import MujocoDynamics, Verified
 from mpc.gauss_newton import FACTORS
-from tasks import pose
 from tasks.benchmarks import pose as benchmark
 from tasks.command import Teller, run
-from tasks.keypoints import figure as figures
-from tasks.keypoints import filmed, lift, metrics, physical
-from tasks.keypoints.figure import SHARED
-from tasks.keypoints.kept import Kept
-from tasks.keypoints.points import POINTS, Keypoints, interpolated
 from tasks.motions import angles, bvh
 from tasks.motions.references import embedded
+from tasks.pose import command, lift, metrics, physical, reconstruction, synthetic_film
+from tasks.pose import figure as figures
+from tasks.pose.checkpoint import Progress
+from tasks.pose.figure import SHARED
+from tasks.pose.points import POINTS, Keypoints, interpolated
 
 
 @pytest.fixture(scope="module")
@@ -35,8 +34,8 @@ def film() -> dict[str, Any]:
     states = reference.states[: reference.strike + 20 : 2, : len(figure.body.links)]
     true = np.asarray(points.points(states.astype(np.float32)), float)
     random = np.random.default_rng(4)
-    lens = filmed.camera_around(random, true)
-    return {"keypoints": filmed.seen(random, lens, true, 50.0), "lens": lens, "true": true}
+    lens = synthetic_film.camera_around(random, true)
+    return {"keypoints": synthetic_film.seen(random, lens, true, 50.0), "lens": lens, "true": true}
 
 
 def written(folder: Path, keypoints: Keypoints, **changed: Any) -> Path:
@@ -51,9 +50,9 @@ def test_a_film_becomes_a_motion_in_mujoco_and_a_reference(film: dict[str, Any],
     at = (lens.position + 3.0 * lens.turn[2]).tolist()
     camera = tmp_path / "camera.json"
     camera.write_text(json.dumps({"focal": lens.focal, "position": lens.position.tolist(), "look_at": at}))
-    pose.main(written(tmp_path, film["keypoints"]), camera=camera, preset="fast", out=out, quiet=True)
+    command.main(written(tmp_path, film["keypoints"]), camera=camera, preset="fast", out=out, quiet=True)
     summary = json.loads((out / "summary.json").read_text())
-    assert not summary["camera_seems_to_move"] and summary["slip_m_s"] < pose.SLIPPING
+    assert not summary["camera_seems_to_move"] and summary["slip_m_s"] < command.SLIPPING
     assert not summary["fell"] and summary["error_px"] < 25.0 and summary["candidates"] > 100
     assert summary["preset"] == "fast" and summary["truth_rollouts"] == 0
     assert summary["height_m"] == pytest.approx(1.75, abs=0.15)
@@ -70,11 +69,11 @@ def test_a_film_becomes_a_motion_in_mujoco_and_a_reference(film: dict[str, Any],
 def test_a_reconstruction_that_was_cut_off_goes_on_as_if_it_had_not_been(
     film: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(pose, "OFTEN", 0.0)
+    monkeypatch.setattr(reconstruction, "OFTEN", 0.0)
     whole, again = tmp_path / "whole", tmp_path / "again"
     short = film["keypoints"].cut(0, 19)
     keypoints = written(tmp_path, short)
-    pose.main(keypoints, preset="fast", out=whole, quiet=True)
+    command.main(keypoints, preset="fast", out=whole, quiet=True)
 
     def interrupted(step: int, steps: int) -> None:
         if step >= 17:
@@ -83,10 +82,10 @@ def test_a_reconstruction_that_was_cut_off_goes_on_as_if_it_had_not_been(
     with monkeypatch.context() as changed:
         changed.setattr(Teller, "bar", lambda self, what: nullcontext(interrupted))
         with pytest.raises(KeyboardInterrupt):
-            pose.main(keypoints, preset="fast", out=again, quiet=True)
+            command.main(keypoints, preset="fast", out=again, quiet=True)
     assert [path.name for path in again.iterdir()] == ["unfinished.npz"]
     capsys.readouterr()
-    pose.main(keypoints, preset="fast", out=again)
+    command.main(keypoints, preset="fast", out=again)
     assert "17 steps done" in capsys.readouterr().out
     assert sorted(path.name for path in again.iterdir()) == sorted(path.name for path in whole.iterdir())
     one, other = (angles.load(folder / "pose.npz") for folder in (whole, again))
@@ -100,31 +99,31 @@ def test_a_film_by_a_camera_that_follows_the_person_is_told_of(
     moves: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     random, true = np.random.default_rng(4), benchmark.filmed_points(None, 2.0)[::2]
-    lens, camera = filmed.camera_around(random, true), tmp_path / "camera.json"
+    lens, camera = synthetic_film.camera_around(random, true), tmp_path / "camera.json"
     camera.write_text(json.dumps({"focal": lens.focal}))
-    seen = filmed.seen(random, lens, filmed.panned(lens, true) if moves else true, 0.5 * benchmark.RATE)
+    seen = synthetic_film.seen(random, lens, synthetic_film.panned(lens, true) if moves else true, 0.5 * benchmark.RATE)
 
     def enough(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(pose, "reconstruct", enough)
+    monkeypatch.setattr(command, "reconstruct", enough)
     with pytest.raises(KeyboardInterrupt):
-        pose.main(written(tmp_path, seen), camera=camera, out=tmp_path / "pose")
+        command.main(written(tmp_path, seen), camera=camera, out=tmp_path / "pose")
     assert ("does the camera move" in capsys.readouterr().out) == moves
 
 
 def test_what_was_kept_of_another_film_or_is_damaged_is_of_no_use(film: dict[str, Any], tmp_path: Path) -> None:
     path = tmp_path / "unfinished.npz"
     found = lift.Lifted(figures.Pose(*(np.zeros(2),) * 3), np.zeros(11), film["lens"], 1.0)
-    Kept(path, "one").keep(found)
-    again = Kept(path, "one")
-    assert again.lifted is not None and again.lifted.error == 1.0 and again.begun is None
-    assert Kept(path, "other").lifted is None
+    Progress(path, "one").save(found)
+    again = Progress(path, "one")
+    assert again.lifted is not None and again.lifted.error == 1.0 and again.checkpoint is None
+    assert Progress(path, "other").lifted is None
     path.write_bytes(path.read_bytes()[:-80])
-    assert Kept(path, "one").lifted is None
+    assert Progress(path, "one").lifted is None
 
 
-@pytest.mark.parametrize("height", pose.HEIGHTS)
+@pytest.mark.parametrize("height", command.HEIGHTS)
 def test_people_of_all_heights_are_simulated_as_large_as_they_are(height: float) -> None:
     figure, proportions = figures.figure(), np.zeros(SHARED)
     proportions[0] = np.log(height / figures.USUAL)
@@ -135,7 +134,7 @@ def test_frames_at_the_ends_in_which_nobody_is_seen_are_left_out(film: dict[str,
     whole = film["keypoints"]
     hidden = Keypoints(whole.places.copy(), whole.confidence.copy(), whole.rate, whole.size)
     hidden.confidence[:3], hidden.confidence[-5:] = 0.0, 0.0
-    left = pose.cut(hidden)
+    left = reconstruction.cut(hidden)
     assert len(left) <= len(whole) - 8
     np.testing.assert_array_equal(left.places[-1], whole.places[len(whole) - 6])
 
@@ -168,7 +167,7 @@ def test_what_cannot_be_reconstructed_is_refused_in_one_line_and_nothing_is_writ
         changed = changed | {"confidence": np.zeros_like(film["keypoints"].confidence)}
     path, out = written(tmp_path, film["keypoints"], **changed), tmp_path / "out"
     with pytest.raises(SystemExit) as ended:
-        run(pose.main, [str(path), "--out", str(out), *arguments])
+        run(command.main, [str(path), "--out", str(out), *arguments])
     error = capsys.readouterr().err
     assert ended.value.code == 2 and said in error and error.count("\n") == 1 and not out.exists()
 
@@ -222,4 +221,4 @@ def test_a_benchmark_that_makes_no_sense_is_refused(arguments: dict[str, Any], s
 
 def test_too_few_frames_are_refused(film: dict[str, Any]) -> None:
     with pytest.raises(InputError, match="6 or more points in 5 frames, but need 10"):
-        pose.cut(film["keypoints"].cut(0, 4))
+        reconstruction.cut(film["keypoints"].cut(0, 4))

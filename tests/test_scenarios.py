@@ -27,7 +27,7 @@ from larp_model.physics import kinematics
 from larp_model.training import Windows
 from tasks import train
 from tasks.benchmarks import model
-from tasks.data import overlaps, resting
+from tasks.episodes.around_kick import overlaps, resting
 from tasks.motions.references import clearance
 from tasks.scenarios import SCENARIOS, around, scenario
 

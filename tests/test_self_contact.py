@@ -13,8 +13,8 @@ from larp_model.engines.episodes import Episodes, record
 from larp_model.engines.mujoco import Truth, closed
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
-from tasks.data import overlaps
-from tasks.motions.generator import any_episodes
+from tasks.episodes.any_motion import any_episodes
+from tasks.episodes.around_kick import overlaps
 from tasks.motions.references import Reference
 
 SCENE = human_and_ball(self_contact=True)

@@ -27,11 +27,11 @@ from mpc import Dynamics, evaluate
 from mpc.search import coloured_noise
 from tasks.benchmarks import report
 from tasks.command import prepare_jax, run
-from tasks.data import random_task
 from tasks.kick import Kick
 from tasks.models import Models, models_of
 from tasks.run import plans_of
 from tasks.session import Session
+from tasks.targets import random_kick
 
 # A candidate is one of the plan's elites, moved by this share of the spread of a first plan.
 AROUND = 0.1
@@ -61,7 +61,7 @@ def candidates_of(
     in_model, in_truth = costs_in(session.models.whole), costs_in(truth.whole)
     rows, parts = [], []
     for index in track(range(targets), description="plans", disable=not sys.stderr.isatty()):
-        target, shift = random_task(random)
+        target, shift = random_kick(random)
         until = kick.reference.strike + 5
         plans = plans_of(session.execute(planners, target, seed + index, kick.start(shift), until))
         for replan in (plans[0], plans[len(plans) // 2], plans[-1]):

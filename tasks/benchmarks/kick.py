@@ -15,14 +15,14 @@ from larp_model.engines.mujoco import FINE_SUBSTEPS
 from larp_model.errors import InputError
 from tasks.benchmarks import report
 from tasks.command import prepare_jax, run
-from tasks.data import random_roll, random_task
+from tasks.episodes.people import random_people
 from tasks.kick import USUAL, Kick
 from tasks.models import DynamicsName
-from tasks.motions.people import random_people
 from tasks.presets import PresetName, preset_of
 from tasks.run import replayed, summarize
 from tasks.sensing import noisy
 from tasks.session import Planners, Session
+from tasks.targets import random_kick, random_roll
 from tasks.task import HEIGHT
 
 WITHIN = (0.1, 0.25, 0.5)
@@ -170,7 +170,7 @@ def main(
 
     jobs = {}
     for index in range(targets):
-        target, shift = random_task(random)
+        target, shift = random_kick(random)
         roll = random_roll(random, rolling) if rolling else np.zeros(2)
         jobs[f"kick {index}"] = partial(one, index, target, shift, roll)
     command = (

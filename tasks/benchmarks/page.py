@@ -31,11 +31,11 @@ from larp_model.errors import InputError
 from mpc.loop import Execution
 from tasks.benchmarks import report
 from tasks.command import prepare_jax, run
-from tasks.data import random_task
 from tasks.kick import USUAL, Kick
 from tasks.live import Choices, Live, due, weights_for
 from tasks.presets import PRESETS, PresetName
 from tasks.session import Session
+from tasks.targets import random_kick
 from viewer import LivePage
 
 # One in `SLOW` clients is slow: it waits `PATIENCE` [s] before each message.
@@ -157,7 +157,7 @@ def main(
     report.ready(json, publish)
     prepare_jax()
     random = np.random.default_rng(seed)
-    targets = [random_task(random)[0] for _ in range(kicks)]
+    targets = [random_kick(random)[0] for _ in range(kicks)]
     kick = Kick.standard()
     choices = Choices({"embedded": lambda: kick}, {preset: PRESETS[preset]}, ("larp",), weights_for(None))
     process, begun = psutil.Process(), time.monotonic()

@@ -19,16 +19,16 @@ from larp_model.names import require_file
 from mpc.gauss_newton import FACTORS
 from tasks.benchmarks import report
 from tasks.command import prepare_jax, run
-from tasks.keypoints import aist as dances
-from tasks.keypoints import figure as figures
-from tasks.keypoints import filmed, lift, metrics, physical
-from tasks.keypoints.camera import Camera
-from tasks.keypoints.figure import SHARED
-from tasks.keypoints.points import Keypoints, interpolated
 from tasks.models import DynamicsName
 from tasks.motions import skeleton
 from tasks.motions.references import embedded, motion_of
-from tasks.pose import reconstruct, shown
+from tasks.pose import aist as dances
+from tasks.pose import figure as figures
+from tasks.pose import lift, metrics, physical, synthetic_film
+from tasks.pose.camera import Camera
+from tasks.pose.figure import SHARED
+from tasks.pose.points import Keypoints, interpolated
+from tasks.pose.reconstruction import reconstruct, shown
 from tasks.presets import PresetName
 
 # Frame rate of a synthetic film [1/s], and the share of it before a kick's strike.
@@ -92,7 +92,7 @@ def filmed_points(clip: Path | None, seconds: float) -> np.ndarray:
         rate, strike = 100.0, reference.strike / 100.0
     else:
         motion = motion_of(clip)
-        points, rate = filmed.points_of(motion), motion.rate
+        points, rate = synthetic_film.points_of(motion), motion.rate
         kick = skeleton.toe_speed(motion).max() >= 1.5 * skeleton.SLOWEST_KICK
         strike = (skeleton.strike(motion) if kick else BEFORE * len(points)) / rate
     whole = np.arange(int((len(points) - 1) * RATE / rate) + 1)
@@ -106,9 +106,9 @@ def of_clip(clip: Path | None, camera: int, seconds: float, seed: int) -> Film:
     """Return a film of some seconds of a clip, seen by a synthetic camera and detector."""
     true = filmed_points(clip, seconds)
     random = np.random.default_rng((seed, camera))
-    lens = filmed.camera_around(random, true)
+    lens = synthetic_film.camera_around(random, true)
     name = "embedded" if clip is None else clip.stem
-    return Film(name, filmed.seen(random, lens, true, RATE), lens, true)
+    return Film(name, synthetic_film.seen(random, lens, true, RATE), lens, true)
 
 
 def of_dance(folder: Path, sequence: str, camera: int, seconds: float) -> Film:

@@ -28,10 +28,10 @@ from larp_model.errors import InputError
 from tasks.benchmarks import replays, report
 from tasks.benchmarks.engines import NAMES, PIPELINES, Question, case, titled
 from tasks.command import prepare_jax, run
-from tasks.data import random_task
 from tasks.kick import Kick
 from tasks.presets import PresetName
 from tasks.session import Session
+from tasks.targets import random_kick
 
 # Engine steps in a step, by engine; all of Brax's pipelines have the same.
 SUBSTEPS = {"larp": (1,), "mujoco": (2, 4, 5, 10, 20, 40), "mjx": (20,), "brax": (20,), "bullet": (20,)}
@@ -163,7 +163,7 @@ def kicks_of(engines: list[replays.Engine], count: int, seed: int) -> dict[str, 
         kicked = replays.executed(session, PRESET, target, seed + index, shift)
         return {"target": target.tolist(), "replays": replays.astray(kick.scene, kicked, players())}
 
-    return {f"kick {index}": partial(one, *random_task(random), index) for index in range(count)}
+    return {f"kick {index}": partial(one, *random_kick(random), index) for index in range(count)}
 
 
 def label(row: report.Row) -> str:

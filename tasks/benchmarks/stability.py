@@ -22,9 +22,9 @@ from larp_model.errors import InputError
 from larp_model.simulator import Simulator
 from mpc import CEM, MPPI, CostTerm, GaussNewton, Gradient, Planner
 from mpc.loop import Phase, Window, execute
-from tasks.benchmarks import pushes, report, slopes
-from tasks.benchmarks.pushes import Bench, refusal, row
+from tasks.benchmarks import gradients, report, stress
 from tasks.benchmarks.report import Row
+from tasks.benchmarks.stress import Bench, refusal, row
 from tasks.command import prepare_jax, run
 from tasks.kick import Kick
 from tasks.models import models_of
@@ -265,7 +265,7 @@ def main(
         weights: manifest of weights that correct larp's physics; none by default.
         publish: put the table into RESULTS.md.
     """
-    kinds = len(pushes.KINDS)
+    kinds = len(stress.KINDS)
     if scenes < kinds:
         raise InputError(f"scenes is {scenes}, but must be at least {kinds}, one of each kind")
     if states < 32:
@@ -277,32 +277,32 @@ def main(
     bench = Bench(kick, whole.dynamics)  # type: ignore[attr-defined]
 
     def scene_rows(kind: str) -> list[Row]:
-        model = bench.model if kind == "human and ball" else Simulator.of_physics(pushes.drawn(kind, None))
-        share = len(range(pushes.KINDS.index(kind), scenes, kinds))
-        return pushes.scene_rows(kind, model, share, 20, seed)
+        model = bench.model if kind == "human and ball" else Simulator.of_physics(stress.drawn(kind, None))
+        share = len(range(stress.KINDS.index(kind), scenes, kinds))
+        return stress.scene_rows(kind, model, share, 20, seed)
 
     jobs: dict[str, Callable[[], list[Row]]] = {
-        f"{body} {field}": partial(pushes.sizes, bench, body, field)
+        f"{body} {field}": partial(stress.sizes, bench, body, field)
         for body, field in (
             ("human", "length"), ("human", "radius"), ("human", "mass"), ("ball", "radius"), ("ball", "mass")
         )
     }  # fmt: skip
     jobs |= {
-        "wild states": partial(pushes.wild_states, bench),
-        "far and lost": partial(pushes.far_and_lost, bench),
-        "offsets": partial(pushes.offsets, bench),
-        "precision": partial(pushes.precision, bench),
-        "batches": partial(pushes.batches, bench),
-        "horizons": partial(pushes.horizons, bench),
-        "capsules": pushes.geometry,
+        "wild states": partial(stress.wild_states, bench),
+        "far and lost": partial(stress.far_and_lost, bench),
+        "offsets": partial(stress.offsets, bench),
+        "precision": partial(stress.precision, bench),
+        "batches": partial(stress.batches, bench),
+        "horizons": partial(stress.horizons, bench),
+        "capsules": stress.geometry,
         "planners": small_planners,
         "targets": partial(targets, bench, whole),
         "execution": partial(execution, bench),
-        "gradients of steps": partial(slopes.of_steps, bench, states, seed),
-        "slopes of a ball": partial(slopes.ball_slopes, bench),
-        "gradients of kicks": partial(slopes.of_kicks, bench, whole, 64, seed),
+        "gradients of steps": partial(gradients.of_steps, bench, states, seed),
+        "slopes of a ball": partial(gradients.ball_slopes, bench),
+        "gradients of kicks": partial(gradients.of_kicks, bench, whole, 64, seed),
     }
-    jobs |= {f"random scenes: {kind}": partial(scene_rows, kind) for kind in pushes.KINDS}
+    jobs |= {f"random scenes: {kind}": partial(scene_rows, kind) for kind in stress.KINDS}
     command = f"python -m tasks.benchmarks.stability --scenes {scenes} --seed {seed} --states {states}"
     rows = [each for found in report.collect(json, command, seen_by(jobs)) for each in found["rows"]]
     held = sum(each["held"] for each in rows)

@@ -18,12 +18,12 @@ from larp_model.errors import InputError
 from mpc import CEM, MPPI, Fallback, GaussNewton, Gradient, Optimizer
 from tasks.benchmarks import report
 from tasks.command import prepare_jax, run
-from tasks.data import random_task
 from tasks.kick import Kick
 from tasks.models import FLIGHT, DynamicsName
 from tasks.presets import PRESETS, Preset
 from tasks.run import plans_of, summarize
 from tasks.session import Session
+from tasks.targets import random_kick
 from tasks.task import BEYOND
 
 # Share by which another point must be better in both error and time to beat a preset.
@@ -161,7 +161,7 @@ def measure(kick: Kick, point: Point, weights: Path | None, targets: int, seed: 
     planners = session.planners(point.preset)
     random, kicks = np.random.default_rng(seed), []
     for index in range(targets):
-        target, shift = random_task(random)
+        target, shift = random_kick(random)
         steps = kick.reference.strike + BEYOND + FLIGHT
         execution = session.execute(planners, target, seed + index, kick.start(shift), steps, recovers=False)
         plans = [plan.info for plan in plans_of(execution)]

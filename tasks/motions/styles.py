@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from larp_model import state as packed
 from larp_model.bodies import segment_of
 from larp_model.scene import Body
-from tasks.data import STRAY
+from tasks.exploration import EXPLORATION_STD
 from tasks.motions import key_poses
 
 
@@ -119,5 +119,5 @@ def moves(random: np.random.Generator, body: Body, count: int, steps: int, dt: f
 def spreads(body: Body) -> np.ndarray:
     """Return the standard deviation (J, 3) [rad] by which angles differ from motion to motion."""
     lower, upper = body.limits
-    usual = [STRAY[segment_of(body.links[child].name)] for child, _, _ in body.motors]
+    usual = [EXPLORATION_STD[segment_of(body.links[child].name)] for child, _, _ in body.motors]
     return np.minimum(1.5 * np.array(usual)[:, None], 0.2 * (upper - lower))

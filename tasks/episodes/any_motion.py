@@ -11,10 +11,11 @@ from larp_model.engines.episodes import Episodes, record
 from larp_model.engines.mujoco import Truth, closed
 from larp_model.rotation import turned_about_z
 from larp_model.scene import Body, Scene
-from tasks.data import STEPS, out_of_legs, overlaps, pushes, random_places, smooth_noise, stray
+from tasks.episodes.around_kick import STEPS, out_of_legs, overlaps, pushes, random_places
+from tasks.episodes.people import random_people
+from tasks.exploration import exploration_std, smooth_noise
 from tasks.motions import styles
 from tasks.motions.details import in_detail
-from tasks.motions.people import random_people
 from tasks.motions.references import Reference, clearance, standing_on_ground
 
 # Shares of kicks and of walks; the rest moves from pose to pose.
@@ -35,7 +36,7 @@ def any_episodes(scene: Scene, reference: Reference, count: int, seed: int, step
     random = np.random.default_rng(seed)
     sizes = random_people(random, scene, count)
     states, targets = in_motion(random, scene, reference, sizes, steps)
-    noise = smooth_noise(random, count, steps, 8, stray(scene))
+    noise = smooth_noise(random, count, steps, 8, exploration_std(scene))
     targets += random.uniform(0.0, 1.2, (count, 1, 1, 1)) * noise
     targets = np.clip(targets, *scene.body("human").limits)
     for pair in scene.between.pairs:

@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from larp_model.errors import InputError
 from larp_model.names import meant, require_file
-from tasks.keypoints import arrays
-from tasks.keypoints.camera import Camera
-from tasks.keypoints.formats import ORDERS
-from tasks.keypoints.points import POINTS, Keypoints
+from tasks.pose import safe_pickle
+from tasks.pose.camera import Camera
+from tasks.pose.formats import ORDERS
+from tasks.pose.points import POINTS, Keypoints
 
 # Frames a second, of all films; how many cameras there are.
 RATE, CAMERAS = 60.0, 9
@@ -163,7 +163,7 @@ def _camera(path: Path, which: int) -> dict[str, np.ndarray]:
 
 def _array(path: Path, name: str, shape: tuple[int | None, ...]) -> np.ndarray:
     require_file("aist", path)
-    held: Any = arrays.load(path)
+    held: Any = safe_pickle.load(path)
     found = held.get(name) if isinstance(held, dict) else None
     needs = ", ".join("T" if length is None else str(length) for length in shape)
     if not isinstance(found, np.ndarray) or found.dtype.kind != "f":

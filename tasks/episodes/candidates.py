@@ -13,9 +13,9 @@ from larp_model.engines.episodes import Episodes
 from larp_model.engines.mujoco import SUBSTEPS
 from mpc import Continued, GaussNewton, MujocoDynamics
 from mpc.dynamics import BatchedTruth
-from tasks.data import random_task
 from tasks.kick import Kick
 from tasks.models import models_of
+from tasks.targets import random_kick
 
 # Optimiser that steps as the presets do, with enough rounds for most kicks to hit.
 STEPS = GaussNewton(rounds=8, directions=24)
@@ -52,7 +52,7 @@ def tried_episodes(kick: Kick, kicks: int, each: int, seed: int, seconds: float 
     planner = kick.planner(replace(whole, dynamics=MujocoDynamics(watched)), (STEPS,))
     parts = []
     for index in range(kicks):
-        target, shift = random_task(random)
+        target, shift = random_kick(random)
         plan, window = planner.init(jax.random.key(seed + index)), kick.window(target)(0)
         planner.step(plan, kick.start(shift), window._replace(steps=None))
         states, controls, after = (np.concatenate(rows) for rows in zip(*watched.seen, strict=True))

@@ -30,12 +30,12 @@ from larp_model.rotation import matrix
 from larp_model.scene import Body, Scene, anchor
 from mpc import CostTerm, Dynamics, GaussNewton, Optimizer, Planner, Verified, quadratic
 from mpc.loop import Checkpoint, Execution, Phase, Window, execute
-from tasks.data import stray
-from tasks.keypoints.camera import Camera
-from tasks.keypoints.figure import Figure, Pose
-from tasks.keypoints.lift import OUTLIER, SLOW, Lifted, noise
-from tasks.keypoints.points import FEET, POINTS, Keypoints, interpolated
+from tasks.exploration import exploration_std
 from tasks.motions.references import clearance, leading, spinning
+from tasks.pose.camera import Camera
+from tasks.pose.figure import Figure, Pose
+from tasks.pose.lift import OUTLIER, SLOW, Lifted, noise
+from tasks.pose.points import FEET, POINTS, Keypoints, interpolated
 from tasks.presets import PresetName
 
 # Spread of a first plan, as a share of the training data's spread around its motions.
@@ -53,7 +53,7 @@ class FitPreset(NamedTuple):
     horizon: int
     knots: int
     steps: GaussNewton
-    every: int = 5
+    interval: int = 5
     verify: int = 0
 
     def optimizers(self, truth: Dynamics | None) -> tuple[Optimizer, ...]:
@@ -190,7 +190,7 @@ def planner_of(
     """
     return Planner(
         dynamics, terms_of(seen, camera, sigma, scene.dt), preset.horizon, preset.knots, scene.dt,
-        SEARCH * stray(scene), preset.optimizers(truth), *scene.limits,
+        SEARCH * exploration_std(scene), preset.optimizers(truth), *scene.limits,
     )  # fmt: skip
 
 

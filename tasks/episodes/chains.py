@@ -9,7 +9,7 @@ from larp_model import state as packed
 from larp_model.engines.episodes import Episodes, record
 from larp_model.engines.mujoco import Truth, closed
 from larp_model.scene import Scene
-from tasks.data import overlaps
+from tasks.episodes.around_kick import overlaps
 from tasks.motions.references import clearance
 
 STEPS = 200

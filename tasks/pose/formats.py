@@ -19,7 +19,7 @@ from scipy.optimize import linear_sum_assignment
 
 from larp_model.errors import InputError
 from larp_model.names import require_file, require_known
-from tasks.keypoints.points import POINTS, RATES, SIDES, Keypoints
+from tasks.pose.points import POINTS, RATES, SIDES, Keypoints
 
 
 def _pairs(*parts: str) -> tuple[str, ...]:

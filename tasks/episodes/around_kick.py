@@ -8,62 +8,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
-from larp_model.bodies import segment_of
 from larp_model.detection import contact_points
 from larp_model.engines.episodes import Episodes, record
 from larp_model.engines.mujoco import Truth, closed
 from larp_model.physics.kinematics import morphology_of
 from larp_model.rotation import turned_about_z
 from larp_model.scene import Link, Scene
-from tasks.motions.people import random_people
+from tasks.episodes.people import random_people
+from tasks.exploration import exploration_std, smooth_noise
 from tasks.motions.references import Reference, clearance, resting
 
 STEPS = 70
-# Deviation of random joint targets from the reference, standard deviation by segment [rad]; the planner's too.
-STRAY = {
-    "abdomen": 0.08,
-    "torso": 0.15,
-    "chest": 0.08,
-    "neck": 0.03,
-    "head": 0.05,
-    "collar": 0.05,
-    "upper_arm": 0.15,
-    "lower_arm": 0.10,
-    "hand": 0.10,
-    "fingers": 0.15,
-    "thumb": 0.10,
-    "thigh": 0.25,
-    "shin": 0.25,
-    "foot": 0.20,
-    "toes": 0.10,
-}
 # A link that weighs less [kg] is pushed less, in proportion: a thumb would spin like a top.
 LIGHT = 0.5
-
-# Kicks that the benchmark asks for: bearing [degrees], distance [m], height [m] of the target; shift of the ball [m].
-BEARING, DISTANCE, HEIGHT, SHIFT = 25.0, (2.0, 5.0), (0.11, 1.0), 0.03
-# Windows over which errors are averaged, as in the paper [steps].
-WINDOWS = (10, 38, 60)
-
-
-def stray(scene: Scene) -> np.ndarray:
-    """Return `STRAY` of every motor and axis (J, 3) [rad]; a fifth of it on axes whose range is 0.45 rad or less."""
-    rows = []
-    for body in scene.bodies:
-        for child, _, motor in body.motors:
-            free = np.subtract(motor.upper, motor.lower) > 0.45
-            rows.append(STRAY[segment_of(body.links[child].name)] * np.where(free, 1.0, 0.2))
-    return np.array(rows)
-
-
-def smooth_noise(random: np.random.Generator, count: int, steps: int, knots: int, scale: np.ndarray) -> np.ndarray:
-    """Return smooth noise (count, steps, J, 3): splines through `knots` normal values of deviation `scale` (J, 3)."""
-    values = random.standard_normal((count, knots, *scale.shape)) * scale
-    return CubicSpline(np.linspace(0.0, 1.0, knots), values, axis=1)(np.linspace(0.0, 1.0, steps))
 
 
 def random_starts(
@@ -194,7 +154,7 @@ def random_episodes(
     sizes = None if sizes is None else sizes[apart]
     rows = np.minimum(begin[:, None] + np.arange(steps), len(reference.controls) - 1)
     size = random.uniform(0.0, 1.2, (count, 1, 1, 1))
-    controls = reference.controls[rows] + size * smooth_noise(random, count, steps, 8, stray(scene))
+    controls = reference.controls[rows] + size * smooth_noise(random, count, steps, 8, exploration_std(scene))
     controls = np.clip(controls, *scene.limits)
     torques = pushes(random, scene, count, steps)
     episodes, diverged = record(Truth(scene, batch=min(count, 256)), states, controls, torques, sizes)
@@ -209,19 +169,3 @@ def pushes(random: np.random.Generator, scene: Scene, count: int, steps: int) ->
     drawn = random.standard_normal((len(pushed), 1, human.stop - human.start, 3))
     torques[pushed, :10, human] = 4.0 * np.minimum(scene.morphology[human, 2:] / LIGHT, 1.0) * drawn
     return torques
-
-
-def random_roll(random: np.random.Generator, fastest: float) -> np.ndarray:
-    """Return a velocity (2,) [m/s], up to `fastest`, of a ball that comes from ahead or from the kicking side."""
-    bearing = np.radians(random.uniform(-90.0, 30.0))
-    return -random.uniform(0.0, fastest) * np.array([np.cos(bearing), np.sin(bearing)])
-
-
-def random_task(random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return a target (3,) [m] and a shift of the ball (2,) [m], as `tasks.benchmarks.kick` draws them."""
-    bearing = np.radians(random.uniform(-BEARING, BEARING))
-    distance, height = random.uniform(*DISTANCE), random.uniform(*HEIGHT)
-    return (
-        np.array([distance * np.cos(bearing), distance * np.sin(bearing), height]),
-        random.uniform(-SHIFT, SHIFT, 2),
-    )

@@ -18,12 +18,12 @@ import numpy as np
 from jax import Array
 from scipy.spatial.transform import Rotation, Slerp
 
-from tasks.keypoints.camera import Camera
-from tasks.keypoints.figure import SHARED, SOLE, Figure, Pose, figure
-from tasks.keypoints.image import TILT, moved, seen_by
-from tasks.keypoints.likely import POSES, usual_poses, within
-from tasks.keypoints.points import FEET, POINTS, Keypoints
-from tasks.keypoints.rows import by_rows, single
+from tasks.pose.camera import Camera
+from tasks.pose.figure import SHARED, SOLE, Figure, Pose, figure
+from tasks.pose.image import TILT, moved, seen_by
+from tasks.pose.points import FEET, POINTS, Keypoints
+from tasks.pose.prior import POSES, usual_poses, within
+from tasks.pose.rows import by_rows, single
 
 # Frames per second that are solved alone, initial headings of each, and steps of the solver.
 SPARSE, HEADINGS, ALONE = 12.0, 12, 12

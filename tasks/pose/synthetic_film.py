@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tasks.keypoints.camera import Camera, focal_length, looking
-from tasks.keypoints.metrics import pelvis
-from tasks.keypoints.points import POINTS, SIDES, Keypoints
 from tasks.motions.skeleton import Motion
+from tasks.pose.camera import Camera, focal_length, looking
+from tasks.pose.metrics import pelvis
+from tasks.pose.points import POINTS, SIDES, Keypoints
 
 # A skeleton's names of the joints at which our points are.
 JOINTS = {

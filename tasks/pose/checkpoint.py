@@ -13,9 +13,9 @@ import numpy as np
 from larp_model.files import write_whole
 from mpc import Plan, PlanInfo
 from mpc.loop import Checkpoint
-from tasks.keypoints.camera import Camera
-from tasks.keypoints.figure import Pose
-from tasks.keypoints.lift import Lifted
+from tasks.pose.camera import Camera
+from tasks.pose.figure import Pose
+from tasks.pose.lift import Lifted
 
 
 class Spent(NamedTuple):
@@ -42,29 +42,29 @@ class Spent(NamedTuple):
         )
 
 
-class Kept:
-    """Checkpoint in a file, which only a reconstruction with the same inputs loads.
+class Progress:
+    """Progress of a reconstruction in a file, which only one with the same inputs loads.
 
-    lifted: the kinematic start; begun: the executed part of the physical fit; each None while there is none. spent:
-    the effort of planning so far.
+    lifted: the kinematic start; checkpoint: the executed part of the physical fit; each None while there is none.
+    spent: the effort of planning so far.
     """
 
     lifted: Lifted | None = None
-    begun: Checkpoint | None = None
+    checkpoint: Checkpoint | None = None
     spent: Spent = Spent()
 
     def __init__(self, path: Path, made_by: str) -> None:
-        """Load the checkpoint; path: npz; made_by: see `fingerprint`. A file of another one, or damaged, is ignored."""
-        self._path, self._made_by = path, made_by
+        """Load the file; path: npz; made_by: see `fingerprint`. A file of another one, or damaged, is ignored."""
+        self.path, self._made_by = path, made_by
         try:
             with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
                 if str(file["made_by"]) == made_by:
                     self._take({name: file[name] for name in file.files})
         except Exception:  # numpy and zipfile raise many kinds for a damaged file
-            self.lifted, self.begun, self.spent = None, None, Spent()
+            self.lifted, self.checkpoint, self.spent = None, None, Spent()
 
-    def keep(self, lifted: Lifted, begun: Checkpoint | None = None, spent: Spent = Spent()) -> None:  # noqa: B008
-        """Write the checkpoint."""
+    def save(self, lifted: Lifted, checkpoint: Checkpoint | None = None, spent: Spent = Spent()) -> None:  # noqa: B008
+        """Write the file."""
         camera = lifted.camera
         content: dict[str, Any] = {
             "made_by": self._made_by,
@@ -74,16 +74,16 @@ class Kept:
             "error": lifted.error,
             "spent": np.array(spent, float),
         }
-        if begun is not None:
-            content |= {f"plan_{name}": value for name, value in begun.plan._asdict().items()}
-            content |= {name: getattr(begun, name) for name in ("states", "controls", "step", "phase")}
+        if checkpoint is not None:
+            content |= {f"plan_{name}": value for name, value in checkpoint.plan._asdict().items()}
+            content |= {name: getattr(checkpoint, name) for name in ("states", "controls", "step", "phase")}
         buffer = io.BytesIO()
         np.savez(buffer, **content)
-        write_whole(self._path, buffer.getvalue())
+        write_whole(self.path, buffer.getvalue())
 
-    def done(self) -> None:
-        """Delete the checkpoint, as the reconstruction is complete."""
-        self._path.unlink(missing_ok=True)
+    def delete(self) -> None:
+        """Delete the file, as the reconstruction is complete."""
+        self.path.unlink(missing_ok=True)
 
     def _take(self, found: dict[str, np.ndarray]) -> None:
         def of(kind: str, fields: tuple[str, ...]) -> Iterator[np.ndarray]:
@@ -97,7 +97,9 @@ class Kept:
         if "states" in found:
             elites, spread, start, key = of("plan", Plan._fields)
             plan = Plan(elites, spread, np.float32(start), key)
-            self.begun = Checkpoint(found["states"], found["controls"], plan, int(found["step"]), int(found["phase"]))
+            self.checkpoint = Checkpoint(
+                found["states"], found["controls"], plan, int(found["step"]), int(found["phase"])
+            )
 
 
 def fingerprint(*parts: Any) -> str:

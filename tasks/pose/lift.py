@@ -12,8 +12,8 @@
 rho is Geman and McClure's, m and S are those of the project's own motions, a_ft says how likely a foot stands (both by
 iteratively reweighted least squares); c is the centre of mass and p the mean position of the feet that stand.
 
-Starting from frames solved alone (`keypoints.alone`), all frames are solved together by Levenberg-Marquardt steps,
-whose matrix is banded with a border (`keypoints.banded`).
+Starting from frames solved alone (`pose.alone`), all frames are solved together by Levenberg-Marquardt steps,
+whose matrix is banded with a border (`pose.banded`).
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ import numpy as np
 from jax import Array
 from scipy.spatial.transform import Rotation
 
-from tasks.keypoints.alone import Alone
-from tasks.keypoints.banded import Banded
-from tasks.keypoints.camera import Camera
-from tasks.keypoints.figure import SHARED, SOLE, USUAL, Figure, Pose, figure
-from tasks.keypoints.image import COMMON, HEIGHT, ROLL, TILT, moved, seen_by
-from tasks.keypoints.likely import within
-from tasks.keypoints.points import FEET, POINTS, SIDES, Keypoints
-from tasks.keypoints.rows import by_rows, single
+from tasks.pose.banded import Banded
+from tasks.pose.camera import Camera
+from tasks.pose.figure import SHARED, SOLE, USUAL, Figure, Pose, figure
+from tasks.pose.image import COMMON, HEIGHT, ROLL, TILT, moved, seen_by
+from tasks.pose.per_frame import Alone
+from tasks.pose.points import FEET, POINTS, SIDES, Keypoints
+from tasks.pose.prior import within
+from tasks.pose.rows import by_rows, single
 
 # Standard deviations: of a detector's points, as a share of the image's larger side; of the body's size, as a share.
 PIXELS, GROWN = 0.004, 0.06

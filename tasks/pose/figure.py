@@ -13,8 +13,8 @@ from jax import Array
 from larp_model.bodies import human, segment_of
 from larp_model.rotation import from_rotation_vector, matrix
 from larp_model.scene import Body, Vector
-from tasks.keypoints.points import FEET, POINTS, SIDES
-from tasks.keypoints.rows import by_rows, single
+from tasks.pose.points import FEET, POINTS, SIDES
+from tasks.pose.rows import by_rows, single
 
 # Sizes that may differ from the usual: links' lengths (0), and the torso's radius (1), which sets the shoulder width.
 PROPORTIONS = (

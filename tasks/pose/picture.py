@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from larp_model.files import write_whole
-from tasks.keypoints.camera import Camera
-from tasks.keypoints.points import POINTS, SIDES, Keypoints
+from tasks.pose.camera import Camera
+from tasks.pose.points import POINTS, SIDES, Keypoints
 
 BONES = [
     *(

@@ -9,8 +9,8 @@ import numpy as np
 from jax import Array
 
 from larp_model.rotation import from_rotation_vector, matrix
-from tasks.keypoints.figure import Figure, figure
 from tasks.motions import styles
+from tasks.pose.figure import Figure, figure
 
 # Standard deviations of angles beyond a joint's limits [rad], and of a trunk's lean [rad].
 BEYOND, LEAN = 0.05, 0.6

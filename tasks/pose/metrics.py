@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tasks.keypoints.points import POINTS
+from tasks.pose.points import POINTS
 
 # Joints that are compared; poses are aligned by the hips.
 JOINTS = [row for row, name in enumerate(POINTS) if name.partition("_")[2] not in ("heel", "toe", "ear")]

@@ -13,9 +13,10 @@ from larp_model.detection import first_contacts
 from larp_model.simulator import Simulator
 from mpc import CEM, Dynamics, Gradient, evaluate
 from mpc.search import coloured_noise
-from tasks.benchmarks.pushes import Bench, in_double, row
 from tasks.benchmarks.report import Row
-from tasks.data import random_episodes, stray
+from tasks.benchmarks.stress import Bench, in_double, row
+from tasks.episodes.around_kick import random_episodes
+from tasks.exploration import exploration_std
 from tasks.kick import Kick
 from tasks.task import KNOTS, SEARCH
 
@@ -128,7 +129,7 @@ def ball_slopes(bench: Bench) -> list[Row]:
 
 def candidates(kick: Kick, count: int, seed: int) -> np.ndarray:
     """Return knots (count, K, J, 3) [rad] as the planner draws them around the reference."""
-    scale = SEARCH * stray(kick.scene)
+    scale = SEARCH * exploration_std(kick.scene)
     return coloured_noise(np.random.default_rng(seed), (count, KNOTS, *scale.shape), CEM.exponent) * scale
 
 

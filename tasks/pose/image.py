@@ -12,8 +12,8 @@ import numpy as np
 from jax import Array
 
 from larp_model.rotation import from_rotation_vector, matrix
-from tasks.keypoints.camera import Camera
-from tasks.keypoints.figure import SHARED, Figure
+from tasks.pose.camera import Camera
+from tasks.pose.figure import SHARED, Figure
 
 COMMON = SHARED + 3 + 2
 # Standard deviations of a camera's unknown pitch and roll [rad], and of its height, as a share.

@@ -1,0 +1,1 @@
+"""Ground-truth episodes that models are trained on and judged by."""

@@ -1,0 +1,178 @@
+"""Command that reconstructs a filmed person's motion from keypoints; the result is a reference for `tasks.kick`."""
+
+from __future__ import annotations
+
+import io
+import json as text
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from rich.table import Table
+
+from larp_model.errors import InputError
+from larp_model.files import require_writable, write_whole
+from tasks.command import Teller, prepare_jax, run
+from tasks.models import DynamicsName
+from tasks.motions import angles, bvh
+from tasks.pose import camera as cameras
+from tasks.pose import figure as figures
+from tasks.pose import formats, lift, metrics, physical
+from tasks.pose.camera import Camera
+from tasks.pose.checkpoint import Progress, fingerprint
+from tasks.pose.lift import Lifted
+from tasks.pose.picture import pose_picture
+from tasks.pose.points import Keypoints
+from tasks.pose.reconstruction import DT, Reconstruction, angles_of, cut, overlay_of, reconstruct
+from tasks.presets import PresetName
+from viewer import write_overlay
+
+# Heights of people [m].
+HEIGHTS = 1.3, 2.2
+# A median error [share of the image] beyond which the figure does not fit the person.
+ASTRAY = 0.03
+# Feet slip less than this in films of a camera that stands still [m/s].
+SLIPPING = 0.12
+
+
+def camera_of(path: Path | None, film: Keypoints) -> tuple[Camera, bool]:
+    """Return the camera of a JSON file, or one held by hand, and whether its position is known."""
+    if path is not None:
+        return cameras.load(path, film.size)
+    if film.size is None:
+        raise InputError("size is not known, but the images' width and height are needed, or a camera file with them")
+    return cameras.held(cameras.focal_length(cameras.FIELD_OF_VIEW, film.size[0]), film.size), False
+
+
+def lifted_of(
+    film: Keypoints, lens: Camera, known: bool, height: float | None, progress: Progress, tell: Teller
+) -> Lifted:
+    """Return the kinematic start, from the saved progress if it is there. known: whether the camera's position is."""
+    if progress.lifted is not None:
+        done = 0 if progress.checkpoint is None else len(progress.checkpoint.controls)
+        tell(f"going on from {progress.path}, {done} steps done")
+        return progress.lifted
+    with tell.part(f"laying a figure over {len(film)} frames"):
+        lifted = lift.lift(film, lens, known, height)
+    progress.save(lifted)
+    return lifted
+
+
+def summary_of(film: Keypoints, result: Reconstruction, slip: float) -> dict[str, Any]:
+    """Return the figures of a reconstruction, entries of `summary.json`. slip: see `metrics.slip` [m/s]."""
+    lifted, spent = result.lifted, result.spent
+    apart = np.linalg.norm(lifted.camera.project(result.found) - film.places, axis=-1)[film.seen]
+    return {
+        "frames": len(film),
+        "rate": film.rate,
+        "height_m": float(figures.figure().height(np.asarray(lifted.proportions))),
+        "camera_m": np.asarray(lifted.camera.position, float).tolist(),
+        "focal_px": float(lifted.camera.focal),
+        "kinematic_error_px": lifted.error,
+        "slip_m_s": slip,
+        "camera_seems_to_move": slip > SLIPPING,
+        "error_px": float(np.median(apart)),
+        "fell": result.fell,
+        "plan_seconds": spent.seconds,
+        "compile_seconds": spent.compile_seconds,
+        "candidates": spent.candidates,
+        "candidates_lost": spent.lost,
+        "truth_rollouts": spent.verified,
+    }
+
+
+def table_of(summary: dict[str, Any]) -> Table:
+    """Return the summary as a table for display."""
+    table = Table("", "", title="Motion from keypoints", show_header=False)
+    table.add_row("frames", f"{summary['frames']}, {summary['frames'] / summary['rate']:.1f} s")
+    table.add_row("height of the person", f"{summary['height_m']:.2f} m")
+    table.add_row(
+        "points off, half of them by less than",
+        f"{summary['error_px']:.1f} px ({summary['kinematic_error_px']:.1f} px before physics)",
+    )
+    table.add_row("fell", "yes" if summary["fell"] else "no")
+    table.add_row("planning", f"{summary['plan_seconds']:.1f} s, {summary['candidates']} candidates")
+    return table
+
+
+def write(folder: Path, film: Keypoints, result: Reconstruction, summary: dict[str, Any]) -> None:
+    """Write the motion, its pictures and, last, `summary.json`; of a human who fell, the kinematic start."""
+    buffer = io.BytesIO()
+    motion = angles_of(result.wanted.states if result.fell else result.states, result.body, DT)
+    np.savez_compressed(buffer, **motion)
+    write_whole(folder / "pose.npz", buffer.getvalue())
+    write_whole(folder / "pose.bvh", bvh.dumps(angles.motion(**motion)).encode())
+    pose_picture(film, result.lifted.camera, result.found, result.start, folder / "pose.png")
+    write_overlay(overlay_of(film, result), folder / "pose.html")
+    write_whole(folder / "summary.json", (text.dumps(summary, indent=2) + "\n").encode())
+
+
+def main(
+    keypoints: Annotated[Path, tyro.conf.Positional],
+    rate: float | None = None,
+    camera: Path | None = None,
+    size: tuple[float, float] | None = None,
+    person: int | None = None,
+    height: float | None = None,
+    dynamics: DynamicsName = "larp",
+    preset: PresetName = "balanced",
+    seed: int = 0,
+    out: Path = Path("runs/pose"),
+    quiet: bool = False,
+    json: bool = False,
+) -> None:
+    """Motion in 3D from the 2D keypoints of a film. A run that was cut off goes on where it was.
+
+    Args:
+        keypoints: of OpenPose (a folder), AlphaPose, MMPose or MediaPipe (JSON), or npz.
+        rate: frames a second of the film, where the file does not say.
+        camera: JSON file of the camera, which stands still: field_of_view (degrees) or focal (px), size, and, where it
+            is known, position and look_at; a phone's by default, its height and tilt estimated.
+        size: width and height of the images (px), where neither file says.
+        person: which of several, in order of appearance from 0; the one who is seen best by default.
+        height: of the person (m); where it is not known, it is estimated by a camera whose position is, and taken to be
+            1.75 m by any other.
+        dynamics: the planner's model: larp or mujoco.
+        preset: how much the plans may cost.
+        seed: of the planner's random numbers.
+        out: folder for summary.json, pose.npz and pose.bvh (each a reference for tasks.kick), pose.png,
+            and pose.html, a replay under the keypoints.
+        quiet: print nothing.
+        json: print the summary as JSON, and on stderr what else is told.
+    """
+    if height is not None and not HEIGHTS[0] <= height <= HEIGHTS[1]:
+        raise InputError(f"height is {height:g}, but must be from {HEIGHTS[0]:g} to {HEIGHTS[1]:g} m")
+    require_writable(out, "out")
+    loaded = formats.load(keypoints, rate, size, person)
+    film = cut(loaded.keypoints)
+    lens, known = camera_of(camera, film)
+    prepare_jax()
+    tell = Teller(quiet, json)
+    if loaded.crossed:
+        tell(f"another person is before or behind this one in {loaded.crossed} frames: look at them in pose.png")
+    of_camera = lens.focal, lens.centre, lens.turn, lens.position, known
+    settings = height or 0.0, dynamics, repr(physical.PRESETS[preset]), seed
+    inputs = fingerprint(film.places, film.confidence, film.rate, *of_camera, *settings)
+    progress = Progress(out / "unfinished.npz", inputs)
+    lifted = lifted_of(film, lens, known, height, progress, tell)
+    if lifted.error > ASTRAY * 2.0 * np.max(lens.centre):
+        tell(f"half of the points are more than {lifted.error:.0f} px off: does the camera move, or is it another one?")
+    slip = metrics.slip(figures.figure().all_points(lifted.pose, lifted.proportions), film.rate)
+    if slip > SLIPPING:
+        tell(f"the feet slip, by {slip:.2f} m/s where they ought to stand: does the camera move, or the ground?")
+    with tell.bar("planning and executing") as at:
+        result = reconstruct(film, lifted, dynamics, physical.PRESETS[preset], seed, progress, at)
+    if result.fell:
+        tell("the human fell: pose.npz and pose.bvh hold the kinematic start instead, which no physics has seen")
+    summary = summary_of(film, result, slip) | {"people": loaded.people, "crossed": loaded.crossed}
+    summary |= {"dynamics": dynamics, "preset": preset, "seed": seed}
+    write(out, film, result, summary)
+    progress.delete()
+    tell.result(table_of(summary), summary)
+    tell(f"{out}/: summary.json, pose.npz, pose.bvh, pose.png, pose.html")
+
+
+def cli() -> None:
+    """Run the command `larp-pose`."""
+    run(main)
