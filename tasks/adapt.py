@@ -41,7 +41,7 @@ HELD_OUT, DRAWN = 64, 256
 # Shares of the time: random episodes, and rollouts of the planner's candidates.
 TRUTH, PLANS = 0.15, 0.2
 # Rollouts taken from each plan, and more kicks than are planned in any time.
-TRIED, KICKS = 128, 1000
+ROLLOUTS_PER_PLAN, KICKS = 128, 1000
 # The check at the end [s], and the least that is worth beginning [min].
 CHECKING, LEAST = 20.0, 2.0
 # More updates than fit into any time.
@@ -60,15 +60,15 @@ class Checked(NamedTuple):
     def better_than(self, other: Checked) -> bool:
         """Return whether errors are smaller on the whole: by the mean of their logarithms."""
         pairs = [*zip(self.human, other.human, strict=True), (self.launch, other.launch)]
-        steps = [math.log(max(mine, 1e-6) / max(its, 1e-6)) for mine, its in pairs if mine + its == mine + its]
+        steps = [math.log(max(own, 1e-6) / max(its, 1e-6)) for own, its in pairs if not math.isnan(own + its)]
         return sum(steps) < 0.0
 
 
 def check(model: Model, weights: Weights, episodes: Episodes) -> Checked:
     """Return the errors of weights on episodes; the human's are infinite where all predictions diverge."""
-    found = evaluation.evaluate(Simulator.of(model, weights), episodes, WINDOWS)
-    human = tuple(math.inf if (error := found["windows"][str(n)]["human"]) is None else error for n in WINDOWS)
-    return Checked(human, found["launch"]["0"].get("relative_error", {}).get("median", math.nan))
+    errors = evaluation.evaluate(Simulator.of(model, weights), episodes, WINDOWS)
+    human = tuple(math.inf if (error := errors["windows"][str(n)]["human"]) is None else error for n in WINDOWS)
+    return Checked(human, errors["launch"]["0"].get("relative_error", {}).get("median", math.nan))
 
 
 def main(
@@ -102,28 +102,31 @@ def main(
         require_file("reference", reference)
     require_writable(out, "out")
     prepare_jax()
-    console, whole = Console(), 60.0 * minutes
+    console, budget_seconds = Console(), 60.0 * minutes
 
-    def tell(what: str) -> None:
-        left = max(0.0, whole - (time.perf_counter() - begin)) / 60.0
-        console.print(f"{what}; {left:.1f} min left")
+    def tell(message: str) -> None:
+        left = max(0.0, budget_seconds - (time.perf_counter() - begin)) / 60.0
+        console.print(f"{message}; {left:.1f} min left")
 
     kick = Kick.standard(reference, height, mass=mass, names=names, body=body)
     scene = kick.scene
-    physics, nothing = ResidualModel(scene), Weights({}, {}, {})
+    physics, no_weights = ResidualModel(scene), Weights({}, {}, {})
     held_out, _ = random_episodes(scene, kick.reference, HELD_OUT, 1_000_000 + seed)
-    before = check(physics, nothing, held_out)
+    before = check(physics, no_weights, held_out)
     tell(f"{HELD_OUT} episodes to check on; {described(before)}")
-    began, parts = time.perf_counter(), list[Episodes]()
-    while not parts or (time.perf_counter() - began < TRUTH * whole and len(parts) * DRAWN < MOST):
+    drawing_began, parts = time.perf_counter(), list[Episodes]()
+    while not parts or (time.perf_counter() - drawing_began < TRUTH * budget_seconds and len(parts) * DRAWN < MOST):
         parts.append(random_episodes(scene, kick.reference, DRAWN, seed + len(parts))[0])
-    random, tried = truth_episodes.join(parts), tried_episodes(kick, KICKS, TRIED, seed, PLANS * whole)
-    tell(f"{len(random.states)} random episodes, {len(tried.states)} of plans")
+    random, of_plans = (
+        truth_episodes.join(parts),
+        tried_episodes(kick, KICKS, ROLLOUTS_PER_PLAN, seed, PLANS * budget_seconds),
+    )
+    tell(f"{len(random.states)} random episodes, {len(of_plans.states)} of plans")
     model = designs.design(scene, "residual", size)
     recipe = replace(OVER_PHYSICS, updates=MOST, seed=seed)
-    left = whole - (time.perf_counter() - begin) - CHECKING
+    left = budget_seconds - (time.perf_counter() - begin) - CHECKING
     with tempfile.TemporaryDirectory() as folder:
-        sources = [(each, float(len(each.states))) for each in (random, tried)]
+        sources = [(drawn, float(len(drawn.states))) for drawn in (random, of_plans)]
         learned, _ = training.train(model, recipe, sources, Path(folder), seconds=left)
     after = check(model, learned, held_out)
     tell(f"trained; {described(after)}")
@@ -138,14 +141,14 @@ def main(
         "before": before._asdict(),
         "after": after._asdict(),
     }
-    written = stored.save(out, "adapted", *((model, learned) if better else (physics, nothing)), content)
+    written = stored.save(out, "adapted", *((model, learned) if better else (physics, no_weights)), content)
     console.print(f"weights: {written}; {time.perf_counter() - begin:.0f} s in all")
 
 
-def described(found: Checked) -> str:
+def described(errors: Checked) -> str:
     """Return the errors in a few words: of the human [mm], of the launch [%]."""
-    human = " / ".join(f"{1000.0 * error:.1f}" for error in found.human)
-    return f"human {human} mm over {' / '.join(map(str, WINDOWS))} steps, launch {100.0 * found.launch:.0f} %"
+    human = " / ".join(f"{1000.0 * error:.1f}" for error in errors.human)
+    return f"human {human} mm over {' / '.join(map(str, WINDOWS))} steps, launch {100.0 * errors.launch:.0f} %"
 
 
 def cli() -> None:

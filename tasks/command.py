@@ -79,16 +79,16 @@ def _interruptible() -> Iterator[None]:
         else:
             before(dropped)
 
-    def unless_interrupted(record: logging.LogRecord) -> bool:
+    def is_not_interrupt(record: logging.LogRecord) -> bool:
         return not (record.exc_info and isinstance(record.exc_info[1], KeyboardInterrupt))
 
     sys.unraisablehook = hook
-    logger.addFilter(unless_interrupted)
+    logger.addFilter(is_not_interrupt)
     try:
         yield
     finally:
         sys.unraisablehook = before
-        logger.removeFilter(unless_interrupted)
+        logger.removeFilter(is_not_interrupt)
 
 
 def _end(code: int, reason: str) -> NoReturn:
@@ -160,15 +160,15 @@ class Teller:
         """
         self._json, self._console = json, Console(quiet=quiet, stderr=json, highlight=False)
 
-    def __call__(self, what: str) -> None:
+    def __call__(self, message: str) -> None:
         """Print a line."""
-        self._console.print(what)
+        self._console.print(message)
 
     @contextmanager
-    def part(self, what: str) -> Iterator[None]:
+    def part(self, label: str) -> Iterator[None]:
         """Print that a part begins and, when it ends, how long it took."""
         begin = time.perf_counter()
-        self._console.print(f"{what} ...", end=" ")
+        self._console.print(f"{label} ...", end=" ")
         try:
             yield
         except BaseException:
@@ -177,12 +177,12 @@ class Teller:
         self._console.print(f"{time.perf_counter() - begin:.1f} s")
 
     @contextmanager
-    def bar(self, what: str) -> Iterator[Callable[[int, int], None]]:
+    def bar(self, label: str) -> Iterator[Callable[[int, int], None]]:
         """Show a progress bar with the remaining time; yields a function to call with what is done and the whole."""
         with Progress(
-            TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=self._console
+            TextColumn(label), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=self._console
         ) as progress:
-            task = progress.add_task(what, total=None)
+            task = progress.add_task(label, total=None)
 
             def at(done: int, whole: int) -> None:
                 progress.update(task, completed=done, total=whole)

@@ -70,6 +70,6 @@ def models_of(
 
 
 def _continued(scene: Scene, models: Sequence[Dynamics], exact: bool, weights: str) -> Models:
-    whole, ball, human = models
+    scene_model, ball_model, human_model = models
     rest = slice(scene.rows(scene.bodies[0].name).stop, None)
-    return Models(Continued(whole, ball, rest, FLIGHT), human, exact, weights)
+    return Models(Continued(scene_model, ball_model, rest, FLIGHT), human_model, exact, weights)

@@ -13,15 +13,15 @@ from larp_model.names import require_known
 from mpc import CEM, MPPI, Dynamics, Fallback, GaussNewton, Gradient, Optimizer
 
 # Time of a replan, as a share of the first plan's, where a budget is given.
-AGAIN = 0.2
+REPLAN_SHARE = 0.2
 # Candidates of the smallest round.
 LEAST = 8
 STEPS = GaussNewton(rounds=2, directions=24)
 # A first plan that misses its target by more, in the model, has failed to converge [m]; so has a replan, which has less
 # time.
-ASTRAY, LATE = (("target", 0.1),), (("target", 0.05),)
-REPLAN = GaussNewton(rounds=1), Fallback(LATE, (GaussNewton(rounds=4),))
-STAND = CEM(samples=64, rounds=2, elites=12, decay=1.0)
+FIRST_TOLERANCE, REPLAN_TOLERANCE = (("target", 0.1),), (("target", 0.05),)
+REPLAN = GaussNewton(rounds=1), Fallback(REPLAN_TOLERANCE, (GaussNewton(rounds=4),))
+RECOVERY = CEM(samples=64, rounds=2, elites=12, decay=1.0)
 
 # Fields of a preset that have another name than they had.
 RENAMED = {"again": "replan", "every": "interval", "enough": "tolerance", "stand": "recovery"}
@@ -45,14 +45,14 @@ class Preset:
     correct: Optimizer = STEPS
     candidates: int = 1
     tolerance: float = 0.004
-    recovery: Stage = (STAND,)
+    recovery: Stage = (RECOVERY,)
 
     def __post_init__(self) -> None:
         for name in ("interval", "candidates"):
-            if not (_whole(value := getattr(self, name)) and value >= 1):
+            if not (_is_integer(value := getattr(self, name)) and value >= 1):
                 raise InputError(f"{name} is {value!r}, but must be an integer of at least 1")
         pair = self.verify
-        if not (isinstance(pair, tuple) and len(pair) == 2 and all(_whole(each) and each >= 0 for each in pair)):
+        if not (isinstance(pair, tuple) and len(pair) == 2 and all(_is_integer(n) and n >= 0 for n in pair)):
             raise InputError(f"verify is {pair!r}, but must be two integers of at least 0, of first plan and replans")
         if not (isinstance(self.tolerance, int | float) and 0.0 <= self.tolerance < math.inf):
             raise InputError(f"tolerance is {self.tolerance!r}, but must be a finite number of at least 0 [m]")
@@ -60,11 +60,11 @@ class Preset:
             stage = getattr(self, name)
             if not (isinstance(stage, tuple) and stage):
                 raise InputError(f"{name} is {stage!r}, but must be a tuple of at least one optimiser")
-            for each in stage:
-                if not isinstance(each, Optimizer):
-                    raise InputError(f"{name} holds {each!r}, which is no optimiser: see mpc.Optimizer")
-                if not _hashable(each):
-                    kind = type(each).__name__
+            for optimizer in stage:
+                if not isinstance(optimizer, Optimizer):
+                    raise InputError(f"{name} holds {optimizer!r}, which is no optimiser: see mpc.Optimizer")
+                if not _hashable(optimizer):
+                    kind = type(optimizer).__name__
                     raise InputError(f"{name} holds a {kind} that cannot be hashed: make it a frozen dataclass")
 
 
@@ -76,35 +76,35 @@ def _hashable(value: object) -> bool:
     return True
 
 
-def _whole(value: object) -> bool:
+def _is_integer(value: object) -> bool:
     return isinstance(value, int) and not isinstance(value, bool)
 
 
-def _found(rounds: int, *around: int) -> Stage:
+def _first_stage(rounds: int, *searches_rounds: int) -> Stage:
     """Return the stage of a first plan: Gauss-Newton steps from the reference, then searches where they end far off.
 
-    rounds: of the steps. around: rounds of each search; the next search is run only where the one before did not
-    converge. A search samples candidates around the reference, as many as the simulator rolls out side by side, and
+    rounds: of the steps. searches_rounds: rounds of each search; the next search is run only where the one before did
+    not converge. A search samples candidates around the reference, as many as the simulator rolls out side by side, and
     steps go on from the best of them. Its spread stays wide: convergence is left to the steps.
     """
     steps = replace(STEPS, rounds=rounds)
-    searches = (CEM(32, each, 8, decay=1.0, floor=0.2) for each in around)
-    return steps, *(Fallback(ASTRAY, (search, steps)) for search in searches)
+    searches = (CEM(32, search_rounds, 8, decay=1.0, floor=0.2) for search_rounds in searches_rounds)
+    return steps, *(Fallback(FIRST_TOLERANCE, (search, steps)) for search in searches)
 
 
 # Points of `tasks.benchmarks.tradeoff`. Over its 16 kicks `balanced` did better with a little sampling in its replans,
 # over 64 others worse.
 PresetName = Literal["fast", "balanced", "accurate"]
 PRESETS: dict[str, Preset] = {
-    "fast": Preset(_found(4, 8), REPLAN, interval=5, recovery=(replace(STAND, rounds=1),)),
-    "balanced": Preset(_found(16, 16, 64), REPLAN, interval=1),
-    "accurate": Preset(_found(16, 16, 64), REPLAN, interval=5, verify=(8, 3)),
+    "fast": Preset(_first_stage(4, 8), REPLAN, interval=5, recovery=(replace(RECOVERY, rounds=1),)),
+    "balanced": Preset(_first_stage(16, 16, 64), REPLAN, interval=1),
+    "accurate": Preset(_first_stage(16, 16, 64), REPLAN, interval=5, verify=(8, 3)),
 }
 
 
 def usable(dynamics: Dynamics, optimizers: Stage) -> Stage:
     """Return the optimisers that work with these dynamics: those that need gradients only where there are some."""
-    return tuple(each for each in optimizers if dynamics.differentiable or not each.differentiates)
+    return tuple(optimizer for optimizer in optimizers if dynamics.differentiable or not optimizer.differentiates)
 
 
 def preset_of(name: str) -> Preset:
@@ -118,10 +118,10 @@ def changed(preset: Preset, changes: Sequence[str]) -> Preset:
     for change in changes:
         path, _, value = change.partition("=")
         try:
-            given = ast.literal_eval(value)
+            new_value = ast.literal_eval(value)
         except (ValueError, SyntaxError):
             raise InputError(f"change is {change!r}, but must be NAME=VALUE, its value a number or (a, b)") from None
-        preset = _changed(preset, path.split("."), given, change)
+        preset = _changed(preset, path.split("."), new_value, change)
     return preset
 
 
@@ -137,8 +137,8 @@ def _changed(part: Any, path: Sequence[str], value: Any, change: str) -> Any:
         return (*part[: int(name)], _changed(part[int(name)], rest, value, change), *part[int(name) + 1 :])
     if isinstance(part, Preset) and name in RENAMED:
         raise InputError(f"change is {change!r}, but {name} is called {RENAMED[name]} now")
-    known = [field.name for field in fields(part)] if is_dataclass(part) else []
-    require_known(f"change is {change!r}: {name}", name, known)
+    names = [field.name for field in fields(part)] if is_dataclass(part) else []
+    require_known(f"change is {change!r}: {name}", name, names)
     return replace(part, **{name: _changed(getattr(part, name), rest, value, change)})
 
 
@@ -151,41 +151,41 @@ class Seconds(NamedTuple):
 
 
 def within(preset: Preset, seconds: float, measure: Callable[[Preset], Seconds]) -> Preset:
-    """Return the preset with as many candidates as its first plan can try in `seconds`, each replan in a fifth of them.
+    """Return the preset with as many candidates as its first plan can evaluate in `seconds`, each replan in a fifth.
 
     The plans that keep the human up do not take longer than replans either, and optimisers that run only where a plan
     failed to converge are left out. measure: returns the times that a preset's plans take.
     """
     if not (math.isfinite(seconds) and seconds > 0.0):
         raise InputError(f"budget is {seconds}, but must be a finite number of seconds > 0")
-    preset = replace(preset, first=_usual(preset.first), replan=_usual(preset.replan))
+    preset = replace(preset, first=_without_fallbacks(preset.first), replan=_without_fallbacks(preset.replan))
     fitting, factors = preset, Seconds(1.0, 1.0, 1.0)
     least = scaled(preset, Seconds(0.0, 0.0, 0.0))
     for _ in range(3):
-        took = measure(fitting)
-        if fitting == least and took.first > seconds:
-            raise InputError(f"budget is {seconds:g} s, but the least that this preset needs is {took.first:.2g} s")
-        replan = AGAIN * seconds
+        times = measure(fitting)
+        if fitting == least and times.first > seconds:
+            raise InputError(f"budget is {seconds:g} s, but the least that this preset needs is {times.first:.2g} s")
+        replan = REPLAN_SHARE * seconds
         factors = Seconds(
-            factors.first * seconds / took.first,
-            factors.replan * replan / took.replan,
-            min(1.0, factors.recovery * replan / took.recovery),
+            factors.first * seconds / times.first,
+            factors.replan * replan / times.replan,
+            min(1.0, factors.recovery * replan / times.recovery),
         )
         fitting = scaled(preset, factors)
     return fitting
 
 
-def _usual(stage: Stage) -> Stage:
-    return tuple(each for each in stage if not isinstance(each, Fallback))
+def _without_fallbacks(stage: Stage) -> Stage:
+    return tuple(optimizer for optimizer in stage if not isinstance(optimizer, Fallback))
 
 
 def scaled(preset: Preset, factors: Seconds) -> Preset:
-    """Return the preset with `factors` times the candidates in its plans; trials in the ground truth stay."""
+    """Return the preset with `factors` times the candidates in its plans, and unchanged validation."""
     return replace(
         preset,
-        first=tuple(fitted(each, factors.first) for each in preset.first),
-        replan=tuple(fitted(each, factors.replan) for each in preset.replan),
-        recovery=tuple(fitted(each, factors.recovery) for each in preset.recovery),
+        first=tuple(fitted(optimizer, factors.first) for optimizer in preset.first),
+        replan=tuple(fitted(optimizer, factors.replan) for optimizer in preset.replan),
+        recovery=tuple(fitted(optimizer, factors.recovery) for optimizer in preset.recovery),
     )
 
 

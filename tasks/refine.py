@@ -146,7 +146,7 @@ def perform(
     kicks = len(shift)
     states = np.repeat(starts(scene, poses), kicks, axis=0)
     states[:, -1, :2] += np.tile(shift, (len(poses), 1))
-    controls = np.stack([each.controls(scene.bodies[0], WATCHED, scene.dt) for each in poses])
+    controls = np.stack([key_pose.controls(scene.bodies[0], WATCHED, scene.dt) for key_pose in poses])
     after, finite = truth.rollout(states, (controls[:, None] + noise).reshape(-1, *controls.shape[1:]))
     after[~finite] = states[~finite, None]  # counts as a kick that never happened
     named = costs(scene, np.concatenate([states[:, None], after], axis=1))
@@ -190,11 +190,11 @@ def main(
     )
     for round_ in range(rounds):
         begin = time.perf_counter()
-        tried = search.ask()
-        poses = [with_numbers(authored, np.asarray(x)) for x in tried]
+        candidates = search.ask()
+        poses = [with_numbers(authored, np.asarray(x)) for x in candidates]
         named = perform(scene, truth, poses, *disturbances(random, scene, kicks, size))
         total = sum(cost.mean(axis=1) for cost in named.values())
-        search.tell(tried, (total + 0.02 * np.mean((np.array(tried) - mean) ** 2, axis=1)).tolist())
+        search.tell(candidates, (total + 0.02 * np.mean((np.array(candidates) - mean) ** 2, axis=1)).tolist())
         if round_ % 10 == 9 or round_ + 1 == rounds:
             # Under disturbances the luckiest candidate is not the best one.
             chosen = search.result.xbest if kicks == 1 else search.mean

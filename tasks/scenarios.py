@@ -65,14 +65,14 @@ def _any(name: str, scene: Scene) -> Scenario:
 
 
 def _thrown(name: str, scene: Scene, *paper: float, varied: bool = True) -> Scenario:
-    known = tuple((body.name, paper) for body in scene.bodies if paper)
-    return Scenario(name, scene, partial(thrown_episodes, scene, varied=varied), CHAIN_WINDOWS, paper=known)
+    paper_errors = tuple((body.name, paper) for body in scene.bodies if paper)
+    return Scenario(name, scene, partial(thrown_episodes, scene, varied=varied), CHAIN_WINDOWS, paper=paper_errors)
 
 
 # The paper's tables 1 and 2.
 SCENARIOS = {
-    each.name: each
-    for each in (
+    entry.name: entry
+    for entry in (
         _human("human_ball", human_and_ball(), ("human", (0.010, 0.031, 0.048)), ("ball", (0.006, 0.033, 0.061))),
         _human(
             "human_capsule", human_and_capsule(), ("human", (0.010, 0.031, 0.050)), ("capsule", (0.010, 0.042, 0.069))
@@ -94,8 +94,8 @@ def around(chosen: Scenario, reference: Path | None, varied: bool) -> Scenario:
     if reference is None and not varied:
         return chosen
     if not any(body.kind in KINDS.values() for body in chosen.scene.bodies):
-        asked = "reference" if reference else "bodies varied"
-        raise InputError(f"{asked} is asked for, but the scene {chosen.name} has no human")
+        argument = "reference" if reference else "bodies varied"
+        raise InputError(f"{argument} is asked for, but the scene {chosen.name} has no human")
     if reference is None:
         return replace(chosen, draw=partial(_around_the_kick, chosen.scene, varied=True), paper=())
     kick = references.captured(reference, _kicking(chosen.scene))
@@ -104,7 +104,7 @@ def around(chosen: Scenario, reference: Path | None, varied: bool) -> Scenario:
 
 def trained_at(name: str, design: DesignName | None = None, size: SizeName | None = None) -> Path:
     """Return the folder in which a run trains a scene's weights; design and size are named where they are given."""
-    return Path("runs/train") / "_".join([name, *(each for each in (design, size) if each)])
+    return Path("runs/train") / "_".join([name, *(part for part in (design, size) if part)])
 
 
 def scenario(name: str) -> Scenario:

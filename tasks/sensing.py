@@ -24,18 +24,18 @@ def noisy(scene: Scene, random: np.random.Generator) -> Callable[[np.ndarray], n
     body, human = scene.bodies[0], scene.rows(scene.bodies[0].name)
 
     def sense(state: np.ndarray) -> np.ndarray:
-        seen = state.copy()
+        noisy_state = state.copy()
         for columns in (packed.VELOCITY, packed.ANGULAR_VELOCITY):
-            seen[:, columns] *= 1.0 + VELOCITIES * random.standard_normal((len(state), 3))
+            noisy_state[:, columns] *= 1.0 + VELOCITIES * random.standard_normal((len(state), 3))
         true = Rotation.from_quat(state[human, packed.ORIENTATION], scalar_first=True)
-        turned = [true[0]]
+        rotations = [true[0]]
         for child, joint in enumerate(body.joints, start=1):
             error = Rotation.from_rotvec(np.radians(JOINTS) * random.standard_normal(3))
-            turned.append(turned[joint.parent] * true[joint.parent].inv() * true[child] * error)
-        seen[human, packed.ORIENTATION] = [each.as_quat(scalar_first=True) for each in turned]
-        truth.reset(seen[None])
-        seen = truth.state()[0]
-        seen[-1, packed.POSITION] += BALL * random.standard_normal(3)
-        return seen
+            rotations.append(rotations[joint.parent] * true[joint.parent].inv() * true[child] * error)
+        noisy_state[human, packed.ORIENTATION] = [rotation.as_quat(scalar_first=True) for rotation in rotations]
+        truth.reset(noisy_state[None])
+        noisy_state = truth.state()[0]
+        noisy_state[-1, packed.POSITION] += BALL * random.standard_normal(3)
+        return noisy_state
 
     return sense

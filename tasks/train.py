@@ -79,13 +79,13 @@ def claim(folder: Path, settings: dict[str, Any]) -> None:
     settings = json.loads(json.dumps(settings))
     if path.is_file():
         try:
-            begun = dict(json.loads(path.read_text()))
+            begun_with = dict(json.loads(path.read_text()))
         except ValueError:
             raise InputError(f"folder is {str(folder)!r}, but its settings.json is damaged: take another one") from None
         for name, value in settings.items():
-            if begun.get(name) != value:
+            if begun_with.get(name) != value:
                 raise InputError(
-                    f"{name} is {value!r}, but the run in {folder} was begun with {begun.get(name)!r}: "
+                    f"{name} is {value!r}, but the run in {folder} was begun with {begun_with.get(name)!r}: "
                     "take another --folder, or delete that one"
                 )
     elif (folder / "random.npz").exists():
@@ -142,8 +142,8 @@ def main(
     sizes = random.morphology
     rounds: list[dict[str, Any]] = []
     if start:
-        given, learned, content = stored.load(start, chosen.scene)
-        if given != model:
+        loaded_model, learned, content = stored.load(start, chosen.scene)
+        if loaded_model != model:
             raise InputError(f"from is {str(start)!r}, but holds weights of another model")
         rounds = content["recipe"]["rounds"]
         sizes = np.concatenate([sizes, stored.extremes(content, chosen.scene)])
@@ -161,7 +161,7 @@ def main(
         updates = max(1, round(effort * stage.recipe.updates))
         recipe = replace(stage.recipe, updates=updates, seed=seed + number)
         learned, log = training.train(model, recipe, [(random, 1.0)], folder / stage.name, learned)
-        curve_picture([folder / each.name for each in stages[: number + 1]], folder / "training.png")
+        curve_picture([folder / past_stage.name for past_stage in stages[: number + 1]], folder / "training.png")
         rounds = [
             *rounds,
             {

@@ -16,7 +16,7 @@ from larp_model.engines.bullet import BulletTruth, give, inertia
 from larp_model.engines.mujoco import Truth, compile_model
 from larp_model.errors import InputError
 from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface
-from tasks.benchmarks.model import second_opinion
+from tasks.benchmarks.model import bullet_errors
 from tasks.episodes.chains import thrown_episodes
 from tasks.exploration import exploration_std, smooth_noise
 from tasks.motions.references import Reference, standing_on_ground
@@ -266,7 +266,7 @@ def test_counts_must_be_positive(name: str) -> None:
 def test_chains_of_every_size_are_thrown_as_in_the_truth(bullet: type[BulletTruth]) -> None:
     scene = Scene((chain(links=2),))
     episodes, _ = thrown_episodes(scene, 4, seed=3, steps=20, varied=True)
-    strayed = second_opinion(scene, episodes, (20,))["20"]["chain"]
+    strayed = bullet_errors(scene, episodes, (20,))["20"]["chain"]
     assert strayed is not None and strayed < 1e-3
     usual = bullet(scene, 4)
     there, _ = usual.rollout(episodes.states[:, 0], episodes.controls, episodes.torques)

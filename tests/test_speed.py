@@ -86,7 +86,7 @@ def test_what_does_not_fit_into_memory_is_refused_before_it_runs(monkeypatch: py
 
 
 def test_time_and_memory_are_taken_in_a_process_of_its_own() -> None:
-    row = speed.Asking()(asked())
+    row = speed.QuestionRunner()(asked())
     assert row["refused"] is None and row["finite"] and row["coarse"]
     assert row["us_per_scene_step"] == pytest.approx(1e3 * row["ms_per_step"] / 2)
     assert row["peak_memory_mib"] >= row["idle_memory_mib"] > 0.0
@@ -94,7 +94,7 @@ def test_time_and_memory_are_taken_in_a_process_of_its_own() -> None:
 
 def test_a_process_that_dies_becomes_a_row_that_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(speed.sys, "executable", "false")
-    assert "code 1" in speed.Asking()(asked())["refused"]
+    assert "code 1" in speed.QuestionRunner()(asked())["refused"]
 
 
 @pytest.mark.parametrize("row", [{"refused": "needs more"}, {"refused": None, "ms_per_step": 1e4}])
@@ -103,12 +103,12 @@ def test_what_an_engine_refused_or_is_slow_at_is_not_asked_again_with_a_larger_b
 ) -> None:
     sizes: list[int] = []
 
-    def answer(self: speed.Asking, question: Question) -> report.Row:
+    def answer(self: speed.QuestionRunner, question: Question) -> report.Row:
         sizes.append(question.batch)
         return row
 
-    monkeypatch.setattr(speed.Asking, "asked", answer)
-    ask = speed.Asking()
+    monkeypatch.setattr(speed.QuestionRunner, "ask", answer)
+    ask = speed.QuestionRunner()
     found = [ask(asked(batch=batch))["refused"] for batch in (8, 64, 512)]
     assert found[0] == row["refused"] and found[1] is not None and found[1] == found[2]
     assert sizes == [8]
@@ -120,7 +120,7 @@ def test_an_engine_that_is_not_installed_says_so(monkeypatch: pytest.MonkeyPatch
 
 
 def test_brax_says_in_its_own_words_why_it_does_not_take_the_human() -> None:
-    assert "not supported" in speed.Asking()(asked("brax spring", "human"))["refused"]
+    assert "not supported" in speed.QuestionRunner()(asked("brax spring", "human"))["refused"]
 
 
 @pytest.mark.parametrize(
@@ -140,7 +140,7 @@ def test_wrong_arguments_are_refused_by_name(arguments: dict[str, str | int], to
 def test_a_replay_comes_nearer_to_the_limit_with_more_engine_steps(scene: Scene, reference: Reference) -> None:
     kicked = replays.Kicked(np.array([4.0, 0.0, 0.3]), reference.states[0], reference.controls[:60])
     players = {("mujoco", substeps): replays.player_of(scene, "mujoco", substeps) for substeps in (2, 20, 160)}
-    coarse, fine, limit = replays.astray(scene, kicked, players)
+    coarse, fine, limit = replays.replay_errors(scene, kicked, players)
     assert (limit["error_m"], limit["launch_error"]) == pytest.approx((0.0, 0.0), abs=1e-9)
     assert fine["launch_error"] < coarse["launch_error"] and fine["error_m"] < coarse["error_m"]
 
@@ -167,7 +167,7 @@ def test_a_replay_that_diverged_is_infinitely_far_off_in_the_median_only() -> No
 def test_the_benchmark_writes_rows_and_pictures_and_touches_no_results(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def answer(self: speed.Asking, question: Question) -> report.Row:
+    def answer(self: speed.QuestionRunner, question: Question) -> report.Row:
         if question.engine.startswith("brax"):
             return {"refused": "no"}
         time = {"ms_per_step": 1.0, "us_per_scene_step": 1.0, "compile_seconds": 1.0}
@@ -180,7 +180,7 @@ def test_the_benchmark_writes_rows_and_pictures_and_touches_no_results(
         }
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(speed.Asking, "asked", answer)
+    monkeypatch.setattr(speed.QuestionRunner, "ask", answer)
     report.RESULTS.write_text("# Results\n")
     speed.main(batch="1,8", kicks=0, json=Path("speed.json"))
     found = json.loads(Path("speed.json").read_text())

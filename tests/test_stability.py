@@ -141,8 +141,8 @@ def test_a_reference_of_bfloat16_becomes_targets_of_32_bits() -> None:
 @pytest.mark.parametrize("kind", ["ball", "chain"])
 def test_random_scenes_neither_crash_nor_hide_what_is_not_finite(kind: str) -> None:
     model = Simulator.of_physics(stress.drawn(kind, None))
-    found = stress.random_scenes(kind, model, scenes=3, each=4, steps=3, seed=0)
-    assert (found.tried, found.crashes, found.silent) == (12, [], 0)
+    found = stress.random_scenes(kind, model, scenes=3, states_per_scene=4, steps=3, seed=0)
+    assert (found.states, found.crashes, found.silent) == (12, [], 0)
 
 
 def test_what_is_hidden_would_be_found() -> None:

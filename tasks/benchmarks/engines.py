@@ -82,8 +82,8 @@ class Question:
     @property
     def name(self) -> str:
         """Return a short description of engine, scene and batch."""
-        what = " gradient" if self.gradient else ""
-        return f"{titled(self.engine, self.substeps)}{what}, {case(self.scene, self.reach)}, batch {self.batch}"
+        suffix = " gradient" if self.gradient else ""
+        return f"{titled(self.engine, self.substeps)}{suffix}, {case(self.scene, self.reach)}, batch {self.batch}"
 
 
 def titled(engine: str, substeps: int) -> str:
@@ -114,16 +114,16 @@ def course(question: Question) -> Course:
     100 m away. human_ball struck: the three steps around the strike, in each of which a link is near the ball, over and
     over; for a gradient, the reference from its start, which includes the strike.
     """
-    whole = human_and_ball()
-    reference = embedded(whole)
+    full_scene = human_and_ball()
+    reference = embedded(full_scene)
     begin, steps = 0, GRADIENT_STEPS if question.gradient else STEPS
     if question.reach == "struck" and not question.gradient:
         begin, steps = reference.strike - BEFORE_STRIKE, STRIKE_STEPS
     if question.scene == "ball":
         begin = reference.strike + FLYING
     bodies = question.scene.split("_")
-    links = np.concatenate([np.arange(len(whole.links))[whole.rows(body)] for body in bodies])
-    motors = np.concatenate([np.arange(len(whole.motors))[whole.motor_rows(body)] for body in bodies])
+    links = np.concatenate([np.arange(len(full_scene.links))[full_scene.rows(body)] for body in bodies])
+    motors = np.concatenate([np.arange(len(full_scene.motors))[full_scene.motor_rows(body)] for body in bodies])
     state = reference.states[begin, links]
     if question.reach == "far":
         state[-1, 0] += AWAY
@@ -131,14 +131,14 @@ def course(question: Question) -> Course:
     random = np.random.default_rng(question.seed)
     offsets = OFFSETS * random.standard_normal((question.batch, 1, len(motors), 3))
     states = np.broadcast_to(state, (question.batch, *state.shape))
-    return Course(whole.only(*bodies), states, (targets + offsets).astype(np.float32))
+    return Course(full_scene.only(*bodies), states, (targets + offsets).astype(np.float32))
 
 
 class Traced(NamedTuple):
     """Functions of an engine that JAX compiles: initialise a batch, step it, and read its ball.
 
-    start: states (N, L, 13) -> initial arrays. enter: these -> carried. step: carried, joint targets (N, J, 3) ->
-    carried. ball: carried -> position and velocity (N, 6) [m, m/s] of the scene's last body, a ball.
+    start: states (N, L, 13) -> initial arrays. enter: these -> carry. step: carry, joint targets (N, J, 3) ->
+    carry. ball: carry -> position and velocity (N, 6) [m, m/s] of the scene's last body, a ball.
     """
 
     start: Callable[[np.ndarray], Leaves]
@@ -168,17 +168,17 @@ def mjx(scene: Scene, substeps: int) -> Traced:
         position, velocity = start
         return position, velocity, jnp.zeros_like(velocity)
 
-    def engine_step(_: Any, carried: Leaves, control: Array) -> Leaves:
-        position, velocity, acceleration = carried
+    def engine_step(_: Any, carry: Leaves, control: Array) -> Leaves:
+        position, velocity, acceleration = carry
         data = blank.replace(qpos=position, qvel=velocity, qacc_warmstart=acceleration, ctrl=control)
         after = mjx.step(model, data)
         return after.qpos, after.qvel, after.qacc_warmstart
 
     @jax.vmap
-    def step(carried: Leaves, control: Array) -> Leaves:
-        return jax.lax.fori_loop(0, substeps, partial(engine_step, control=control.reshape(-1)), carried)
+    def step(carry: Leaves, control: Array) -> Leaves:
+        return jax.lax.fori_loop(0, substeps, partial(engine_step, control=control.reshape(-1)), carry)
 
-    return Traced(partial(_coordinates, scene), enter, step, lambda carried: _last(*carried[:2]))
+    return Traced(partial(_coordinates, scene), enter, step, lambda carry: _last(*carry[:2]))
 
 
 def brax(pipeline: str, scene: Scene, substeps: int) -> Traced:
@@ -194,15 +194,15 @@ def brax(pipeline: str, scene: Scene, substeps: int) -> Traced:
     system = mjcf.load_model(compiled)
     chosen = importlib.import_module(f"brax.{pipeline}.pipeline")
 
-    def engine_step(_: Any, carried: Leaves, control: Array) -> Leaves:
-        return chosen.step(system, carried, control)
+    def engine_step(_: Any, carry: Leaves, control: Array) -> Leaves:
+        return chosen.step(system, carry, control)
 
     @jax.vmap
-    def step(carried: Leaves, control: Array) -> Leaves:
-        return jax.lax.fori_loop(0, substeps, partial(engine_step, control=control.reshape(-1)), carried)
+    def step(carry: Leaves, control: Array) -> Leaves:
+        return jax.lax.fori_loop(0, substeps, partial(engine_step, control=control.reshape(-1)), carry)
 
     enter = jax.vmap(lambda start: chosen.init(system, *start))
-    return Traced(partial(_coordinates, scene), enter, step, lambda carried: _last(carried.q, carried.qd))
+    return Traced(partial(_coordinates, scene), enter, step, lambda carry: _last(carry.q, carry.qd))
 
 
 def _coordinates(scene: Scene, states: np.ndarray) -> tuple[Array, Array]:
@@ -253,9 +253,9 @@ def compiled(program: Callable[..., Any], *arguments: Any) -> Compiled:
     begin = time.perf_counter()
     ready = jax.jit(program).lower(*arguments).compile()
     seconds = time.perf_counter() - begin
-    found, free = ready.memory_analysis(), available_memory()
-    if found is not None and free is not None:
-        needed = found.argument_size_in_bytes + found.output_size_in_bytes + found.temp_size_in_bytes
+    analysis, free = ready.memory_analysis(), available_memory()
+    if analysis is not None and free is not None:
+        needed = analysis.argument_size_in_bytes + analysis.output_size_in_bytes + analysis.temp_size_in_bytes
         if needed > free:
             raise RefusedError(f"needs {needed / 2**30:.1f} GiB of memory, of {free / 2**30:.1f}")
     return Compiled(ready, seconds)
@@ -265,10 +265,10 @@ def available_memory() -> int | None:
     """Return the free memory [bytes] of JAX's first device; None where it is unknown."""
     device = jax.devices()[0]
     if device.platform != "cpu":
-        found = device.memory_stats() or {}
-        return found["bytes_limit"] - found["bytes_in_use"] if "bytes_limit" in found else None
-    stated = _stated(Path("/proc/meminfo"), "MemAvailable")
-    return None if stated is None else 1024 * stated
+        stats = device.memory_stats() or {}
+        return stats["bytes_limit"] - stats["bytes_in_use"] if "bytes_limit" in stats else None
+    free_kib = _proc_field(Path("/proc/meminfo"), "MemAvailable")
+    return None if free_kib is None else 1024 * free_kib
 
 
 def peak_memory() -> float:
@@ -276,20 +276,20 @@ def peak_memory() -> float:
 
     On Linux, child programs inherit `ru_maxrss`, so that a small child would show its parent's; `VmHWM` is read there.
     """
-    stated = _stated(Path("/proc/self/status"), "VmHWM")
-    if stated is not None:
-        return stated / 1024
+    peak_kib = _proc_field(Path("/proc/self/status"), "VmHWM")
+    if peak_kib is not None:
+        return peak_kib / 1024
     unit = 2**20 if sys.platform == "darwin" else 2**10
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
-def _stated(path: Path, field: str) -> int | None:
+def _proc_field(path: Path, field: str) -> int | None:
     """Return a field [KiB] of a table in Linux's /proc; None where there is none."""
-    found = re.search(rf"^{field}:\s+(\d+)", path.read_text(), re.MULTILINE) if path.exists() else None
-    return int(found.group(1)) if found else None
+    match = re.search(rf"^{field}:\s+(\d+)", path.read_text(), re.MULTILINE) if path.exists() else None
+    return int(match.group(1)) if match else None
 
 
-def timed(run: Callable[[int], float], unit: int, most: int) -> report.Row:
+def timed(run: Callable[[int], float], unit: int, max_steps: int) -> report.Row:
     """Return the milliseconds per step: median and range of `RUNS` runs of `most` steps, or of fewer within `SECONDS`.
 
     run: number of steps, a multiple of `unit` -> seconds that they take. Its first call is not counted, unless it alone
@@ -297,35 +297,35 @@ def timed(run: Callable[[int], float], unit: int, most: int) -> report.Row:
     """
     first = run(unit)
     if first > SECONDS:
-        took, steps = [first], unit
+        seconds, steps = [first], unit
     else:
         once = max(run(unit), 1e-9)
-        steps = unit * int(np.clip(SECONDS / RUNS / once, 1, most // unit))
-        took = [run(steps) for _ in range(int(np.clip(SECONDS / (once * steps / unit), 1, RUNS)))]
-    each = 1e3 * np.array(took) / steps
+        steps = unit * int(np.clip(SECONDS / RUNS / once, 1, max_steps // unit))
+        seconds = [run(steps) for _ in range(int(np.clip(SECONDS / (once * steps / unit), 1, RUNS)))]
+    ms_per_step = 1e3 * np.array(seconds) / steps
     return {
-        "ms_per_step": float(np.median(each)),
-        "ms_per_step_range": [float(each.min()), float(each.max())],
+        "ms_per_step": float(np.median(ms_per_step)),
+        "ms_per_step_range": [float(ms_per_step.min()), float(ms_per_step.max())],
         "steps": steps,
-        "runs": len(took),
+        "runs": len(seconds),
     }
 
 
-def time_traced(question: Question, what: Course) -> report.Row:
+def time_traced(question: Question, workload: Course) -> report.Row:
     """Measure a step of an engine that JAX compiles; see `timed`."""
-    traced = TRACED[question.engine](what.scene, question.substeps)
-    start, controls = traced.start(what.states), jnp.moveaxis(jnp.asarray(what.controls), 1, 0)
-    again = len(controls)
+    traced = TRACED[question.engine](workload.scene, question.substeps)
+    start, controls = traced.start(workload.states), jnp.moveaxis(jnp.asarray(workload.controls), 1, 0)
+    period = len(controls)
 
     def program(start: Leaves, controls: Array, steps: Array) -> Leaves:
-        begun = traced.enter(start)
+        initial = traced.enter(start)
 
-        def body(step: Array, carried: Leaves) -> Leaves:
-            if again < STEPS:
-                carried = jax.tree.map(lambda new, old: jnp.where(step % again == 0, new, old), begun, carried)
-            return traced.step(carried, controls[step % again])
+        def body(step: Array, carry: Leaves) -> Leaves:
+            if period < STEPS:
+                carry = jax.tree.map(lambda new, old: jnp.where(step % period == 0, new, old), initial, carry)
+            return traced.step(carry, controls[step % period])
 
-        return jax.lax.fori_loop(0, steps, body, begun)
+        return jax.lax.fori_loop(0, steps, body, initial)
 
     ready = compiled(program, start, controls, jnp.int32(1))
 
@@ -337,20 +337,22 @@ def time_traced(question: Question, what: Course) -> report.Row:
         last = jax.block_until_ready(ready.run(start, controls, jnp.int32(steps)))
         return time.perf_counter() - begin
 
-    found = timed(run, again if again < STEPS else 1, STEPS)
-    return found | {"compile_seconds": ready.seconds, "finite": finite(last)}
+    timing = timed(run, period if period < STEPS else 1, STEPS)
+    return timing | {"compile_seconds": ready.seconds, "finite": finite(last)}
 
 
-def time_gradient(question: Question, what: Course) -> report.Row:
+def time_gradient(question: Question, workload: Course) -> report.Row:
     """Measure `GRADIENT_STEPS` steps forward, and the same steps with the gradient by start and joint targets.
 
     The function that is differentiated is the sum of squares of all that the engine carries at the end.
     """
-    traced = TRACED[question.engine](what.scene, question.substeps)
-    start, controls = traced.start(what.states), jnp.moveaxis(jnp.asarray(what.controls), 1, 0)
+    traced = TRACED[question.engine](workload.scene, question.substeps)
+    start, controls = traced.start(workload.states), jnp.moveaxis(jnp.asarray(workload.controls), 1, 0)
 
     def cost(start: Leaves, controls: Array) -> Array:
-        last, _ = jax.lax.scan(lambda each, control: (traced.step(each, control), None), traced.enter(start), controls)
+        last, _ = jax.lax.scan(
+            lambda carry, control: (traced.step(carry, control), None), traced.enter(start), controls
+        )
         return sum((jnp.sum(leaf**2) for leaf in jax.tree.leaves(last) if _differentiable(leaf)), jnp.float32(0.0))
 
     last: Leaves = None
@@ -382,25 +384,25 @@ def finite(leaves: Leaves) -> bool:
     return all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(leaves))
 
 
-def time_stepped(question: Question, what: Course) -> report.Row:
+def time_stepped(question: Question, workload: Course) -> report.Row:
     """Measure a step of an engine outside JAX; resetting it to its start is not counted."""
-    engine: Any = STEPPED[question.engine](what.scene, question.substeps, question.batch)
-    again = what.controls.shape[1]
-    last = what.states
+    engine: Any = STEPPED[question.engine](workload.scene, question.substeps, question.batch)
+    period = workload.controls.shape[1]
+    last = workload.states
 
     def run(steps: int) -> float:
         nonlocal last
-        took = 0.0
-        for begin in range(0, steps, again):
-            engine.reset(what.states)
+        seconds = 0.0
+        for begin in range(0, steps, period):
+            engine.reset(workload.states)
             before = time.perf_counter()
-            for step in range(min(again, steps - begin)):
-                last = engine.step(what.controls[:, step])
-            took += time.perf_counter() - before
-        return took
+            for step in range(min(period, steps - begin)):
+                last = engine.step(workload.controls[:, step])
+            seconds += time.perf_counter() - before
+        return seconds
 
-    found = timed(run, again if again < STEPS else 1, STEPS)
-    return found | {"compile_seconds": 0.0, "finite": bool(np.isfinite(last).all())}
+    timing = timed(run, period if period < STEPS else 1, STEPS)
+    return timing | {"compile_seconds": 0.0, "finite": bool(np.isfinite(last).all())}
 
 
 def answer(question: Question) -> report.Row:
@@ -408,9 +410,9 @@ def answer(question: Question) -> report.Row:
     idle, compiles = peak_memory(), question.engine in TRACED
     row = asdict(question) | {"device": jax.devices()[0].device_kind if compiles else "cpu", "refused": None}
     take_time = time_gradient if question.gradient else time_traced if compiles else time_stepped
-    what = course(question)
+    workload = course(question)
     try:
-        row |= take_time(question, what)
+        row |= take_time(question, workload)
     except ImportError as error:
         row["refused"] = f"is not installed ({error.name or error})"
     except Exception as error:  # an engine may fail in any way: its message is the result
@@ -423,8 +425,8 @@ def answer(question: Question) -> report.Row:
 
 def words(error: Exception) -> str:
     """Return an error's message in one line of less than 160 characters."""
-    said = (str(error).strip() or type(error).__name__).splitlines()[0]
-    return said if len(said) < 160 else f"{said[:157]}..."
+    message = (str(error).strip() or type(error).__name__).splitlines()[0]
+    return message if len(message) < 160 else f"{message[:157]}..."
 
 
 if __name__ == "__main__":

@@ -68,28 +68,33 @@ def candidates_of(
             window = kick.window(target)(replan.step)
             elites = replan.plan.elites[np.arange(candidates) % len(replan.plan.elites)]
             noise = coloured_noise(np.random.default_rng(seed + index), elites.shape, 2.0)
-            tried = elites + AROUND * spread * noise
+            perturbed = elites + AROUND * spread * noise
             controls = jnp.stack(
-                [planners.first.controls(replan.plan._replace(elites=each[None]), window.reference) for each in tried]
+                [
+                    planners.first.controls(replan.plan._replace(elites=knots[None]), window.reference)
+                    for knots in perturbed
+                ]
             )
             context = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), window.context)
             state = jnp.asarray(replan.state, jnp.float32)
-            believed, _ = in_model(state, controls, context)
-            true, states = in_truth(state, controls, context)
-            sound = np.isfinite(np.asarray(true)) & np.isfinite(np.asarray(believed))
+            predicted, _ = in_model(state, controls, context)
+            true_costs, states = in_truth(state, controls, context)
+            is_finite = np.isfinite(np.asarray(true_costs)) & np.isfinite(np.asarray(predicted))
             rows.append(
                 {
                     "target": target.tolist(),
                     "step": replan.step,
-                    "rank_correlation": float(spearmanr(believed[sound], true[sound]).statistic),
-                    "model_cost": np.asarray(believed)[sound].tolist(),
-                    "truth_cost": np.asarray(true)[sound].tolist(),
+                    "rank_correlation": float(spearmanr(predicted[is_finite], true_costs[is_finite]).statistic),
+                    "model_cost": np.asarray(predicted)[is_finite].tolist(),
+                    "truth_cost": np.asarray(true_costs)[is_finite].tolist(),
                 }
             )
-            whole = np.concatenate([np.broadcast_to(state, (candidates, 1, *state.shape)), states], axis=1)[sound]
-            torques = np.zeros((len(whole), controls.shape[1], len(kick.scene.links), 3), np.float32)
-            morphology = np.broadcast_to(kick.scene.morphology, (len(whole), *kick.scene.morphology.shape))
-            parts.append(Episodes(whole, np.asarray(controls)[sound], torques, morphology))
+            trajectories = np.concatenate([np.broadcast_to(state, (candidates, 1, *state.shape)), states], axis=1)[
+                is_finite
+            ]
+            torques = np.zeros((len(trajectories), controls.shape[1], len(kick.scene.links), 3), np.float32)
+            morphology = np.broadcast_to(kick.scene.morphology, (len(trajectories), *kick.scene.morphology.shape))
+            parts.append(Episodes(trajectories, np.asarray(controls)[is_finite], torques, morphology))
     return rows, Episodes(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
@@ -100,10 +105,10 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
     steps = np.array([row["step"] for row in rows])
     for which, name, colour in zip(range(3), ("first plan", "half-way", "last plan"), MARKS, strict=True):
         chosen = [row for index, row in enumerate(rows) if index % 3 == which]
-        believed = np.concatenate([row["model_cost"] for row in chosen])
+        predicted = np.concatenate([row["model_cost"] for row in chosen])
         true = np.concatenate([row["truth_cost"] for row in chosen])
         axes.scatter(
-            believed, true, s=6, alpha=0.4, color=colour, label=f"{name}, step {int(np.median(steps[which::3]))}"
+            predicted, true, s=6, alpha=0.4, color=colour, label=f"{name}, step {int(np.median(steps[which::3]))}"
         )
     low, high = axes.get_xlim()[0], max(axes.get_xlim()[1], axes.get_ylim()[1])
     axes.plot([max(low, 1e-2), high], [max(low, 1e-2), high], color="0.6", lw=1)
@@ -151,10 +156,10 @@ def main(
     table = Table("measure", "value", title="Gap on the planner's own candidates")
     for plan, rank in ranks.items():
         table.add_row(f"rank correlation of costs, {plan} plan", f"{rank:.2f}")
-    for before, found in launch.items():
+    for before, errors in launch.items():
         for measure, unit, scale in (("relative_error", " %", 100.0), ("angle_deg", " deg", 1.0)):
-            values = ", ".join(f"{q} {scale * found[measure][q]:.1f}{unit}" for q in ("median", "p75", "p90"))
-            table.add_row(f"launch from {before} steps before contact, {measure}, {found['count']} balls", values)
+            values = ", ".join(f"{q} {scale * errors[measure][q]:.1f}{unit}" for q in ("median", "p75", "p90"))
+            table.add_row(f"launch from {before} steps before contact, {measure}, {errors['count']} balls", values)
     report.show(table)
     if publish:
         report.publish("gap", f"Gap on the planner's own candidates, {targets} kicks", command, table)

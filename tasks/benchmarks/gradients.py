@@ -66,7 +66,7 @@ def step_gradients(bench: Bench, states: np.ndarray, controls: np.ndarray, seed:
             reverse = sum(jnp.sum(g * d, axis=(1, 2)) for g, d in zip(pull(against), direction, strict=True))
             return forward, jnp.sum(forward * against, axis=(1, 2)), jnp.asarray(reverse)
 
-        forward, paired, reverse = (np.asarray(each) for each in both((states, controls), along, against))
+        forward, paired, reverse = (np.asarray(array) for array in both((states, controls), along, against))
         run = jax.jit(model.step)
         errors = []
         for width in DIFFERENCES:
@@ -80,8 +80,8 @@ def step_gradients(bench: Bench, states: np.ndarray, controls: np.ndarray, seed:
 def of_steps(bench: Bench, count: int, seed: int) -> list[Row]:
     """Return rows that compare reverse, forward and central differences of a step on random states."""
     states, controls = around_contact(bench, count, seed)
-    found = step_gradients(bench, states, controls, seed)
-    reverse, differences = found["reverse"], found["differences"]
+    comparison = step_gradients(bench, states, controls, seed)
+    reverse, differences = comparison["reverse"], comparison["differences"]
     rows = [
         row(
             "gradient of a step",
@@ -95,12 +95,12 @@ def of_steps(bench: Bench, count: int, seed: int) -> list[Row]:
         errors = differences[:, part]
         kinked = int((errors[0] > AGREE).sum())
         best = errors.min(axis=0)
-        seen = (
+        observation = (
             f"median {np.median(errors[0]):.0e}, worst {best.max():.1e}; {kinked} of {errors.shape[1]} "
             f"needed less than {DIFFERENCES[0]:.0e}: a kink is nearer; {int((best > AGREE).sum())} jump"
         )
         promise = f"forward = central differences within {100 * AGREE:g} %, |apart| / |forward|"
-        rows.append(row("gradient of a step", f"{name}, float64", promise, seen, bool(best.max() <= AGREE)))
+        rows.append(row("gradient of a step", f"{name}, float64", promise, observation, bool(best.max() <= AGREE)))
     return rows
 
 
@@ -122,8 +122,8 @@ def ball_slopes(bench: Bench) -> list[Row]:
         states[:, 0, 7], states[:, 0, 11] = speed, speed / radius
         steep = np.abs(np.asarray(slope(jnp.asarray(states)))[:, 7:, 0, 2])
         promise = "LARP: 1 mm of height changes a step's speed and spin by less than 1 m/s and 1 rad/s"
-        seen = f"at most {steep[:, :3].max() / 1e3:.2g} m/s, {steep[:, 3:].max() / 1e3:.2g} rad/s"
-        rows.append(row("slope of a ball's step", name, promise, seen, bool(steep.max() <= 1e3)))
+        observation = f"at most {steep[:, :3].max() / 1e3:.2g} m/s, {steep[:, 3:].max() / 1e3:.2g} rad/s"
+        rows.append(row("slope of a ball's step", name, promise, observation, bool(steep.max() <= 1e3)))
     return rows
 
 
@@ -145,7 +145,9 @@ class Slope:
         self.scale = planner.scale
 
         def summed(knots: jax.Array, steps: jax.Array) -> tuple[jax.Array, jax.Array]:
-            targets = jax.vmap(lambda each: planner.controls(plan._replace(elites=each[None]), controls))(knots)
+            targets = jax.vmap(lambda candidate: planner.controls(plan._replace(elites=candidate[None]), controls))(
+                knots
+            )
             states = model.rollout(jnp.broadcast_to(start, (len(knots), *start.shape)), targets, steps=steps)
             costs = jax.vmap(lambda s, u: evaluate(kick.terms, s, u, context)[0])(states, targets)
             return jnp.sum(costs), costs
@@ -169,7 +171,7 @@ def update_of(gradient: np.ndarray, scale: np.ndarray) -> np.ndarray:
     return moved / np.where(scale > 0, scale, 1.0)
 
 
-def of_kicks(bench: Bench, whole: Dynamics, count: int, seed: int) -> list[Row]:
+def of_kicks(bench: Bench, continued_model: Dynamics, count: int, seed: int) -> list[Row]:
     """Return rows of a kick's reverse gradient in float32: its norm by the number of steps it goes back.
 
     The kick has 48 steps, and 120 of flight.
@@ -178,7 +180,7 @@ def of_kicks(bench: Bench, whole: Dynamics, count: int, seed: int) -> list[Row]:
     rows = []
     for name, model, lengths in (
         ("scene", bench.model, (8, 24, 33, bench.kick.horizon)),
-        ("scene, then 120 of the ball alone", whole, (8, 33, bench.kick.horizon)),
+        ("scene, then 120 of the ball alone", continued_model, (8, 33, bench.kick.horizon)),
     ):
         slope = Slope(bench.kick, model)
         for steps in lengths:
@@ -187,11 +189,13 @@ def of_kicks(bench: Bench, whole: Dynamics, count: int, seed: int) -> list[Row]:
             norms = np.linalg.norm(gradient.reshape(count, -1).astype(float), axis=1)[np.isfinite(costs)]
             norms = np.nan_to_num(norms, nan=np.inf)
             value = f"{steps} steps of the {name}"
-            seen = f"{entries} of {count} not finite"
-            rows.append(row("gradient of a kick", value, "every gradient finite in float32", seen, entries == 0))
+            observation = f"{entries} of {count} not finite"
+            rows.append(row("gradient of a kick", value, "every gradient finite in float32", observation, entries == 0))
             half, most, worst = np.quantile(norms, (0.5, 0.9, 1.0), method="lower")
-            seen = f"median {half:.1e}, 90 % below {most:.1e}, worst {worst:.1e}"
-            rows.append(row("gradient of a kick", value, f"norm below {USEFUL:g} per spread", seen, worst <= USEFUL))
+            observation = f"median {half:.1e}, 90 % below {most:.1e}, worst {worst:.1e}"
+            rows.append(
+                row("gradient of a kick", value, f"norm below {USEFUL:g} per spread", observation, worst <= USEFUL)
+            )
     finite = np.isfinite(gradient).all(axis=(1, 2, 3))
     for name, factor in (("as it is", 1.0), ("times 1e20", np.float32(1e20))):
         enlarged = gradient[finite] * factor
@@ -199,6 +203,8 @@ def of_kicks(bench: Bench, whole: Dynamics, count: int, seed: int) -> list[Row]:
         moved = np.linalg.norm(update_of(enlarged, slope.scale).reshape(len(enlarged), -1), axis=1)
         stuck = int((moved == 0.0).sum())
         whole_steps = bool(np.isfinite(moved).all() and stuck == 0)
-        seen = f"{stuck} of {len(moved)} stand still, longest step {moved.max():.2g} spreads"
-        rows.append(row("step down a kick's gradient", name, "every candidate takes a finite step", seen, whole_steps))
+        observation = f"{stuck} of {len(moved)} stand still, longest step {moved.max():.2g} spreads"
+        rows.append(
+            row("step down a kick's gradient", name, "every candidate takes a finite step", observation, whole_steps)
+        )
     return rows

@@ -33,8 +33,8 @@ def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
     truth = np.array([row["truth_error_m"] for row in rows])
     limit = np.array([row["limit_error_m"] for row in rows])
     halved = np.array([row["halved_error_m"] for row in rows])
-    again = np.array([row["replan_ms"]["p50"] for row in rows])
-    worst = np.array([row["replan_ms"]["p99"] for row in rows])
+    replan_medians = np.array([row["replan_ms"]["p50"] for row in rows])
+    replan_p99 = np.array([row["replan_ms"]["p99"] for row in rows])
     return {
         "mean_truth_error_m": float(truth.mean()),
         "median_truth_error_m": float(np.median(truth)),
@@ -52,7 +52,7 @@ def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "touched": int(sum(row["touched"] for row in rows)),
         "falls": int(sum(row["fell"] for row in rows)),
         "mean_plan_seconds": float(np.mean([row["plan_seconds"] for row in rows])),
-        "replan_ms": {"p50": float(np.median(again)), "p99": float(worst.max())},
+        "replan_ms": {"p50": float(np.median(replan_medians)), "p99": float(replan_p99.max())},
         "compile_seconds": float(sum(row["compile_seconds"] for row in rows)),
         "truth_rollouts": int(sum(row["truth_rollouts"] for row in rows)),
     }
@@ -137,8 +137,8 @@ def main(
         "budget": f"{budget:g}" if budget is not None else "",
         "substeps": f"{substeps}" if substeps != FINE_SUBSTEPS else "",
     }
-    said = {option: value for option, value in variant.items() if value}
-    name = "_".join(["kick", preset, dynamics, *(f"{option}_{value}" for option, value in said.items())])
+    options = {option: value for option, value in variant.items() if value}
+    name = "_".join(["kick", preset, dynamics, *(f"{option}_{value}" for option, value in options.items())])
     json = json or Path(f"runs/benchmarks/{name}.json")
     report.ready(json, publish, weights)
     prepare_jax()
@@ -181,10 +181,10 @@ def main(
         "self_contact": "--self-contact",
         "noise": "--noise",
     }
-    command = " ".join([command, *(flags.get(option, f"--{option} {value}") for option, value in said.items())])
+    command = " ".join([command, *(flags.get(option, f"--{option} {value}") for option, value in options.items())])
     rows = report.collect(json, command, jobs)
     figures = summarise(rows)
-    title = ", ".join([f"Kick: {preset}", dynamics, *(f"{option} {value}" for option, value in said.items())])
+    title = ", ".join([f"Kick: {preset}", dynamics, *(f"{option} {value}" for option, value in options.items())])
     report.write_json(json, {"command": command, "hardware": report.hardware(), **figures, "rows": rows})
     report.write_picture(json.with_suffix(".png"), picture(rows, title))
 

@@ -86,12 +86,12 @@ def main(
     for argument, value in (("sequences", sequences), ("substeps", substeps)):
         if value < 1:
             raise InputError(f"{argument} is {value}, but must be at least 1")
-    what = [
+    labels = [
         scene,
         *(path.stem for path in (weights, reference) if path),
         *(["bodies varied"] if bodies == "varied" else []),
     ]
-    name = "_".join(["model", *what]).replace(" ", "_")
+    name = "_".join(["model", *labels]).replace(" ", "_")
     json = json or Path(f"runs/benchmarks/{name}.json")
     report.ready(json, publish, weights)
     prepare_jax()
@@ -103,11 +103,11 @@ def main(
     if states is None:
         drawn, _ = chosen.draw(sequences, seed)
         truth = Truth(chosen.scene, min(len(drawn.states), 64), substeps)
-        starts, *given = drawn
-        episodes, _ = truth_episodes.record(truth, starts[:, 0], *given)
+        starts, *inputs = drawn
+        episodes, _ = truth_episodes.record(truth, starts[:, 0], *inputs)
     else:
         episodes = truth_episodes.load(states, chosen.scene)
-    found = judged(weights, chosen, episodes)
+    results = errors_of(weights, chosen, episodes)
     source = f"--states {states.name}" if states else f"--sequences {sequences} --seed {seed}"
     if weights:
         source = f"--weights {weights} {source}"
@@ -119,33 +119,33 @@ def main(
         source += " --bodies varied"
     if beside:
         source += f" --beside {beside}"
-        found["beside"] = {"design": beside, **judged(other, chosen, episodes)}
+        results["beside"] = {"design": beside, **errors_of(other, chosen, episodes)}
     if bullet:
         source += " --bullet"
-        found["bullet"] = second_opinion(chosen.scene, episodes, chosen.windows)
+        results["bullet"] = bullet_errors(chosen.scene, episodes, chosen.windows)
     command = f"python -m tasks.benchmarks.model --scene {scene} {source}"
-    report.write_json(json, {"command": command, "hardware": report.hardware(), **found})
-    title = f"{', '.join(what)}: {len(episodes.states)} sequences"
-    report.write_picture(json.with_suffix(".png"), picture(found["windows"], chosen, title))
-    tables = [table_of(found, chosen), *launch_tables(found["launch"])]
+    report.write_json(json, {"command": command, "hardware": report.hardware(), **results})
+    title = f"{', '.join(labels)}: {len(episodes.states)} sequences"
+    report.write_picture(json.with_suffix(".png"), picture(results["windows"], chosen, title))
+    tables = [table_of(results, chosen), *launch_tables(results["launch"])]
     for table in tables:
         report.show(table)
     if publish:
-        report.publish(name, f"Model: {', '.join(what)}", command, *tables)
+        report.publish(name, f"Model: {', '.join(labels)}", command, *tables)
 
 
-def judged(manifest: Path | None, chosen: Scenario, episodes: Episodes) -> dict[str, Any]:
+def errors_of(manifest: Path | None, chosen: Scenario, episodes: Episodes) -> dict[str, Any]:
     """Return errors of weights, or of physics alone without a manifest, and the time of a step per batch size.
 
     See `evaluation.evaluate`.
     """
     scene = chosen.scene
     simulator = Simulator.of_physics(scene) if manifest is None else Simulator.load(manifest, scene)
-    found = evaluation.evaluate(simulator, episodes, chosen.windows)
-    return found | {"us_per_step": {str(size): step_time(simulator, episodes, size) for size in BATCHES}}
+    errors = evaluation.evaluate(simulator, episodes, chosen.windows)
+    return errors | {"us_per_step": {str(size): step_time(simulator, episodes, size) for size in BATCHES}}
 
 
-def second_opinion(scene: Scene, episodes: Episodes, windows: Sequence[int]) -> dict[str, dict[str, float | None]]:
+def bullet_errors(scene: Scene, episodes: Episodes, windows: Sequence[int]) -> dict[str, dict[str, float | None]]:
     """Return Bullet's position errors against the ground truth over the first n steps; see `evaluation.evaluate`.
 
     Needs the extra `bullet`. Two engines that agree on the equations differ in contact compliance and friction: a
@@ -155,18 +155,18 @@ def second_opinion(scene: Scene, episodes: Episodes, windows: Sequence[int]) -> 
     for row in range(len(episodes.states)):
         own = slice(row, row + 1)
         world = BulletTruth(scene.sized(episodes.morphology[row]))
-        given = episodes.controls[own, :longest], episodes.torques[own, :longest]
-        parts.append(world.rollout(episodes.states[own, 0], *given)[0])
+        inputs = episodes.controls[own, :longest], episodes.torques[own, :longest]
+        parts.append(world.rollout(episodes.states[own, 0], *inputs)[0])
         world.close()
-    distance, kept = evaluation.distances(np.concatenate(parts), episodes, longest)
-    return evaluation.by_window(scene, distance[kept], windows)
+    distance, is_finite = evaluation.distances(np.concatenate(parts), episodes, longest)
+    return evaluation.by_window(scene, distance[is_finite], windows)
 
 
 def step_time(simulator: Simulator, episodes: Episodes, size: int, runs: int = 5) -> float:
     """Return the median time of a step per scene [us], in a batch of `size` over the first steps of episodes."""
     rows = np.arange(size) % len(episodes.states)
-    given = episodes.states[rows, 0], episodes.controls[rows, :TIMED], episodes.torques[rows, :TIMED]
-    state, controls, torques, sizes = (jnp.asarray(each) for each in (*given, episodes.morphology[rows]))
+    inputs = episodes.states[rows, 0], episodes.controls[rows, :TIMED], episodes.torques[rows, :TIMED]
+    state, controls, torques, sizes = (jnp.asarray(array) for array in (*inputs, episodes.morphology[rows]))
     roll = jax.jit(simulator.rollout)
     seconds = []
     for _ in range(runs + 1):  # the first compiles
@@ -176,44 +176,44 @@ def step_time(simulator: Simulator, episodes: Episodes, size: int, runs: int = 5
     return 1e6 * float(np.median(seconds[1:])) / (size * controls.shape[1])
 
 
-def said(value: float | None, how: str, unit: str) -> str:
+def with_unit(value: float | None, form: str, unit: str) -> str:
     """Return a mean with its unit as text, or "all diverged" for None."""
-    return "all diverged" if value is None else f"{value:{how}} {unit}"
+    return "all diverged" if value is None else f"{value:{form}} {unit}"
 
 
-def table_of(found: dict[str, Any], chosen: Scenario) -> Table:
+def table_of(results: dict[str, Any], chosen: Scenario) -> Table:
     """Return a table of the errors that `judged` returns, beside the paper's and, if present, others'."""
     table, paper = (
         Table("measure", *(f"{n} steps" for n in chosen.windows), title=f"Model: {chosen.name}"),
         chosen.paper,
     )
     for body in chosen.scene.bodies:
-        errors = (said(found["windows"][str(n)][body.name], ".4f", "m") for n in chosen.windows)
+        errors = (with_unit(results["windows"][str(n)][body.name], ".4f", "m") for n in chosen.windows)
         table.add_row(f"{body.name}, position error", *errors)
         if body.name in dict(paper):
             table.add_row(f"{body.name}, the paper", *(f"{value:.3f} m" for value in dict(paper)[body.name]))
-        if "beside" in found:
-            other = found["beside"]
-            errors = (said(other["windows"][str(n)][body.name], ".4f", "m") for n in chosen.windows)
+        if "beside" in results:
+            other = results["beside"]
+            errors = (with_unit(other["windows"][str(n)][body.name], ".4f", "m") for n in chosen.windows)
             table.add_row(f"{body.name}, the {other['design']} design trained here", *errors)
-        if "bullet" in found:
-            errors = (said(found["bullet"][str(n)][body.name], ".4f", "m") for n in chosen.windows)
+        if "bullet" in results:
+            errors = (with_unit(results["bullet"][str(n)][body.name], ".4f", "m") for n in chosen.windows)
             table.add_row(f"{body.name}, Bullet", *errors)
     beside = [""] * (len(chosen.windows) - 1)
-    for name, turned in found["rotation_rad"].items():
-        table.add_row(f"{name}, rotation error", *beside, said(turned, ".3f", "rad"))
-    table.add_row("joint displacement", *beside, said(found["displacement_m"], ".5f", "m"))
-    table.add_row("diverged", *beside, f"{found['diverged']} of {found['sequences']}")
-    for whose in (found, *([found["beside"]] if "beside" in found else [])):
-        name = f", the {whose['design']} design" if whose is not found else ""
+    for name, turned in results["rotation_rad"].items():
+        table.add_row(f"{name}, rotation error", *beside, with_unit(turned, ".3f", "rad"))
+    table.add_row("joint displacement", *beside, with_unit(results["displacement_m"], ".5f", "m"))
+    table.add_row("diverged", *beside, f"{results['diverged']} of {results['sequences']}")
+    for whose in (results, *([results["beside"]] if "beside" in results else [])):
+        name = f", the {whose['design']} design" if whose is not results else ""
         cells = (f"{value:.3g} us, {size} side by side" for size, value in whose["us_per_step"].items())
         table.add_row(f"a step of a scene{name}", *cells)
     return table
 
 
-def launch_tables(found: dict[str, Any]) -> Iterator[Table]:
+def launch_tables(launches: dict[str, Any]) -> Iterator[Table]:
     """Yield a table of launch errors, all and by kind, per number of steps before contact; see `Launches.summary`."""
-    for before, launch in found.items():
+    for before, launch in launches.items():
         if not launch["count"]:
             continue
         quantiles = "median / 75 % / 90 %"

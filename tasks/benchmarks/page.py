@@ -86,13 +86,13 @@ def watch(address: str, clients: int, visits: Synchronized[int]) -> None:
             visits.value += 1
 
 
-def until(what: Callable[[], object], seconds: float = 120.0) -> float:
+def until(condition: Callable[[], object], seconds: float = 120.0) -> float:
     """Wait until a condition is true and return the time that took [s].
 
     The condition is polled rarely, for polling takes time from the planner. Raises RuntimeError after `seconds`.
     """
     begin = time.monotonic()
-    while not what():
+    while not condition():
         if time.monotonic() - begin > seconds:
             raise RuntimeError(f"nothing happened for {seconds:g} s")
         time.sleep(0.02)
@@ -105,12 +105,12 @@ def of_kick(live: Live, ask: Callable[[], None]) -> report.Row:
     drawn = list[tuple[float, int]]()
     ask()
 
-    def over() -> bool:
+    def is_done() -> bool:
         if page.mode == "running":
             drawn.append((time.monotonic(), page.frames))
         return live.run is not before and page.mode == "replay"
 
-    until(over)
+    until(is_done)
     assert live.run is not None
     summary = live.run.summary
     return {
@@ -160,7 +160,7 @@ def main(
     targets = [random_kick(random)[0] for _ in range(kicks)]
     kick = Kick.standard()
     choices = Choices({"embedded": lambda: kick}, {preset: PRESETS[preset]}, ("larp",), weights_for(None))
-    process, begun = psutil.Process(), time.monotonic()
+    process, begin = psutil.Process(), time.monotonic()
     session = Session(kick)
     session.run(USUAL, preset)  # what plans and steps keeps its threads
     before = process.num_threads()
@@ -195,7 +195,7 @@ def main(
     figures = summary(rows) | {
         "memory_growth": grown,
         "sockets_left": len(process.net_connections("tcp")),
-        "minutes": (time.monotonic() - begun) / 60.0,
+        "minutes": (time.monotonic() - begin) / 60.0,
         "visits": visits.value,
         "threads_before": before,
         "threads_after": process.num_threads(),
@@ -228,17 +228,17 @@ def headless(live: Live, session: Session, target: np.ndarray, preset: PresetNam
 
     The pace is the same as on the page because planning after a pause is slower anyway.
     """
-    begun = time.monotonic()
+    due_at = time.monotonic()
 
     def observe(execution: Execution) -> None:
-        nonlocal begun
-        begun = due(begun, session.task.scene.dt)
-        time.sleep(max(0.0, begun - time.monotonic()))
+        nonlocal due_at
+        due_at = due(due_at, session.task.scene.dt)
+        time.sleep(max(0.0, due_at - time.monotonic()))
 
     live.page.panel.playing = False
-    found = session.run(target, preset, seed, observe=observe).summary
+    figures = session.run(target, preset, seed, observe=observe).summary
     live.page.panel.playing = True
-    return {"plan_seconds": found["plan_seconds"], "replan_ms": found["replan_ms"]["p50"]}
+    return {"plan_seconds": figures["plan_seconds"], "replan_ms": figures["replan_ms"]["p50"]}
 
 
 def summary(rows: dict[str, report.Row]) -> dict[str, Any]:

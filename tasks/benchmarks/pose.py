@@ -37,7 +37,7 @@ Way = Literal["kinematic", "larp", "mujoco", "mujoco_timed"]
 WAYS: tuple[Way, ...] = ("kinematic", "larp", "mujoco")
 COLORS = {"kinematic": "#9aa5b1", "larp": "#1f6fb2", "mujoco": "#e69f00", "mujoco_timed": "#b3541e"}
 # Figures of each way by their name in the JSON: title and unit in the table.
-TOLD = {
+MEASURES = {
     "mpjpe_g_mm": ("MPJPE-G", "mm"),
     "mpjpe_mm": ("MPJPE", "mm"),
     "mpjpe_pa_mm": ("MPJPE-PA", "mm"),
@@ -95,8 +95,8 @@ def filmed_points(clip: Path | None, seconds: float) -> np.ndarray:
         points, rate = synthetic_film.points_of(motion), motion.rate
         kick = skeleton.toe_speed(motion).max() >= 1.5 * skeleton.SLOWEST_KICK
         strike = (skeleton.strike(motion) if kick else BEFORE * len(points)) / rate
-    whole = np.arange(int((len(points) - 1) * RATE / rate) + 1)
-    points = interpolated(points, rate, whole / RATE)
+    frame_numbers = np.arange(int((len(points) - 1) * RATE / rate) + 1)
+    points = interpolated(points, rate, frame_numbers / RATE)
     count = min(round(seconds * RATE), len(points))
     first = int(np.clip(round((strike - BEFORE * seconds) * RATE), 0, len(points) - count))
     return points[first : first + count]
@@ -115,15 +115,15 @@ def of_dance(folder: Path, sequence: str, camera: int, seconds: float) -> Film:
     """Return a film of the first seconds of a dance of AIST++, seen by one of its cameras."""
     name = dances.video(sequence, camera)
     keypoints, lens, true = dances.load(folder, sequence, camera)
-    begun = keypoints.cut(0, round(seconds * keypoints.rate) - 1)
+    excerpt = keypoints.cut(0, round(seconds * keypoints.rate) - 1)
     try:
-        first, last = shown(begun)
+        first, last = shown(excerpt)
     except InputError as error:
         raise InputError(f"sequences has {name!r}, whose {error}") from None
     true = true[first : last + 1]
     if np.isnan(metrics.pelvis(true)).any(axis=(1, 2)).all():
         raise InputError(f"sequences has {name!r}, of which no frame has both hips")
-    return Film(name, begun.cut(first, last), lens, true)
+    return Film(name, excerpt.cut(first, last), lens, true)
 
 
 def dances_of(folder: Path, names: Sequence[str], cameras: int, seconds: float) -> dict[str, Callable[[], Film]]:
@@ -131,8 +131,8 @@ def dances_of(folder: Path, names: Sequence[str], cameras: int, seconds: float) 
 
     Loads each film once, to raise an error if one is missing or damaged.
     """
-    there = sorted(dances.sequences(folder).keys() & {path.stem for path in (folder / "keypoints2d").glob("*.pkl")})
-    names = names or [video for video in EASY if dances.seen_by(video)[0] in there] or there
+    available = sorted(dances.sequences(folder).keys() & {path.stem for path in (folder / "keypoints2d").glob("*.pkl")})
+    names = names or [video for video in EASY if dances.seen_by(video)[0] in available] or available
     if not names:
         raise InputError(f"aist is {str(folder)!r}, but keypoints2d in it has no sequence that mapping.txt has")
     films: dict[str, Callable[[], Film]] = {}
@@ -147,8 +147,8 @@ def dances_of(folder: Path, names: Sequence[str], cameras: int, seconds: float) 
 def as_fast(preset: physical.FitPreset, share: float) -> physical.FitPreset:
     """Return a preset with which each plan tries a share of the candidates, in one round."""
     steps = preset.steps
-    tried = 1 + steps.rounds * (steps.directions + len(FACTORS))
-    directions = max(1, round(share * tried) - 1 - len(FACTORS))
+    candidates = 1 + steps.rounds * (steps.directions + len(FACTORS))
+    directions = max(1, round(share * candidates) - 1 - len(FACTORS))
     return preset._replace(steps=replace(steps, rounds=1, directions=directions))
 
 
@@ -157,7 +157,7 @@ def measured(film: Callable[[], Film], ways: Sequence[Way], preset: physical.Fit
     name, keypoints, lens, true = film()
     lifted = lift.lift(keypoints, lens)
 
-    def judged(points: np.ndarray) -> dict[str, float]:
+    def errors_of(points: np.ndarray) -> dict[str, float]:
         return metrics.position_errors(points, true) | metrics.off_the_ground(points) | {
             "mpjpe_2d_px": metrics.pixel_error(lens.project(points), lens.project(true)),
             "velocity": metrics.velocity_error(points, true, keypoints.rate),
@@ -174,38 +174,38 @@ def measured(film: Callable[[], Film], ways: Sequence[Way], preset: physical.Fit
     names: dict[Way, DynamicsName] = {"larp": "larp", "mujoco": "mujoco", "mujoco_timed": "mujoco"}
     for way in ways:
         if way == "kinematic":
-            row[way] = judged(figures.figure().all_points(lifted.pose, lifted.proportions))
+            row[way] = errors_of(figures.figure().all_points(lifted.pose, lifted.proportions))
             continue
-        tried = preset
+        way_preset = preset
         if way == "mujoco_timed":
-            tried = as_fast(preset, row["larp"]["plan_seconds"] / row["mujoco"]["plan_seconds"])
-        made = reconstruct(keypoints, lifted, names[way], tried, seed)
-        row[way] = judged(made.found) | {
-            "fell": 100.0 * made.fell,
-            "plan_seconds": made.spent.seconds,
-            "ms_per_candidate": 1e3 * made.spent.seconds / made.spent.candidates,
+            way_preset = as_fast(preset, row["larp"]["plan_seconds"] / row["mujoco"]["plan_seconds"])
+        reconstruction = reconstruct(keypoints, lifted, names[way], way_preset, seed)
+        row[way] = errors_of(reconstruction.found) | {
+            "fell": 100.0 * reconstruction.fell,
+            "plan_seconds": reconstruction.spent.seconds,
+            "ms_per_candidate": 1e3 * reconstruction.spent.seconds / reconstruction.spent.candidates,
         }
     return row
 
 
 def means(rows: list[dict[str, Any]], way: Way) -> dict[str, float]:
     """Return the mean over all films of each figure of a way."""
-    return {name: float(np.mean([row[way][name] for row in rows])) for name in TOLD if name in rows[0][way]}
+    return {name: float(np.mean([row[way][name] for row in rows])) for name in MEASURES if name in rows[0][way]}
 
 
 def picture(rows: list[dict[str, Any]], ways: Sequence[Way]) -> Figure:
     """Plot the position errors of every film, by way."""
     figure = Figure(figsize=(9.0, 4.0), layout="constrained")
     axes = figure.subplots(1, 3, sharey=True)
-    for each, name in zip(axes, ("mpjpe_g_mm", "mpjpe_mm", "mpjpe_pa_mm"), strict=True):
+    for panel, name in zip(axes, ("mpjpe_g_mm", "mpjpe_mm", "mpjpe_pa_mm"), strict=True):
         for place, way in enumerate(ways):
             values = [row[way][name] for row in rows]
-            each.scatter(place + np.linspace(-0.15, 0.15, len(values)), values, s=22, color=COLORS[way])
-            each.plot([place - 0.3, place + 0.3], 2 * [np.mean(values)], color=COLORS[way], lw=2)
-        each.set(title=TOLD[name][0], xticks=range(len(ways)), xlim=(-0.6, len(ways) - 0.4), yscale="log")
-        each.set_xticklabels([way.replace("_", "\n") for way in ways])
-        each.yaxis.set_major_formatter("{x:g}")
-        each.yaxis.set_minor_formatter("{x:g}")
+            panel.scatter(place + np.linspace(-0.15, 0.15, len(values)), values, s=22, color=COLORS[way])
+            panel.plot([place - 0.3, place + 0.3], 2 * [np.mean(values)], color=COLORS[way], lw=2)
+        panel.set(title=MEASURES[name][0], xticks=range(len(ways)), xlim=(-0.6, len(ways) - 0.4), yscale="log")
+        panel.set_xticklabels([way.replace("_", "\n") for way in ways])
+        panel.yaxis.set_major_formatter("{x:g}")
+        panel.yaxis.set_minor_formatter("{x:g}")
     axes[0].set_ylabel("error of a film's joints [mm]; line: mean")
     return figure
 
@@ -271,20 +271,22 @@ def main(
     command = f"python -m tasks.benchmarks.pose{named} --cameras {cameras} --seconds {seconds:g}{chosen} --seed {seed}"
     jobs = {name: partial(measured, film, ways, physical.PRESETS[preset], seed) for name, film in films.items()}
     rows = report.collect(json, command, jobs)
-    found = {way: means(rows, way) for way in ways}
-    content = {"command": command, "hardware": report.hardware(), "means": found, "rows": rows}
+    averages = {way: means(rows, way) for way in ways}
+    content = {"command": command, "hardware": report.hardware(), "means": averages, "rows": rows}
     report.write_json(json, content)
     report.write_picture(json.with_suffix(".png"), picture(rows, ways))
-    beside = {} if aist is None else {who: dict(zip(TOLD, each, strict=False)) for who, each in PAPER.items()}
+    beside = (
+        {} if aist is None else {source: dict(zip(MEASURES, values, strict=False)) for source, values in PAPER.items()}
+    )
     title = f"Motion from keypoints, {preset}, {len(rows)} film{'' if len(rows) == 1 else 's'}"
     if beside:
         title += " of AIST++, beside the paper's figures, of videos that it does not name"
     table = Table("measure", *ways, *beside, title=title)
-    for name, (measure, unit) in TOLD.items():
-        values = [f"{found[way][name]:.3g} {unit}" if name in found[way] else "" for way in ways]
-        theirs = [figures.get(name) for figures in beside.values()]
+    for name, (measure, unit) in MEASURES.items():
+        values = [f"{averages[way][name]:.3g} {unit}" if name in averages[way] else "" for way in ways]
+        published = [figures.get(name) for figures in beside.values()]
         if any(values):
-            table.add_row(measure, *values, *("" if each is None else f"{each:g}" for each in theirs))
+            table.add_row(measure, *values, *("" if values is None else f"{values:g}" for values in published))
     if skates := [row["true_foot_skate"] for row in rows if "true_foot_skate" in row]:
         table.add_row("foot skate of what was filmed", f"{np.mean(skates):.3g} %")
     report.show(table)

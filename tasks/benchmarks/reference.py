@@ -121,8 +121,8 @@ def table(kicks: list[ReferenceKick]) -> Table:
     for kick in kicks:
         rows.add_row(kick.name, kick.kind, *(text(column, value) for column, value in kick.figures().items()))
     if others := [kick.figures() for kick in kicks[1:] if kick.kind == "kick"]:
-        found = {column: [figures[column] for figures in others] for column in COLUMNS}
-        ranges = (f"{text(column, min(values))} to {text(column, max(values))}" for column, values in found.items())
+        captured = {column: [figures[column] for figures in others] for column in COLUMNS}
+        ranges = (f"{text(column, min(values))} to {text(column, max(values))}" for column, values in captured.items())
         rows.add_row("captured", "kicks", *ranges)
     return rows
 

@@ -53,8 +53,8 @@ def player_of(scene: Scene, engine: str, substeps: int) -> Player:
 
     @jax.jit
     def roll(start: Any, controls: jax.Array) -> jax.Array:
-        def step(carried: Any, control: jax.Array) -> tuple[Any, jax.Array]:
-            after = traced.step(carried, control)
+        def step(carry: Any, control: jax.Array) -> tuple[Any, jax.Array]:
+            after = traced.step(carry, control)
             return after, traced.ball(after)[0]
 
         return jax.lax.scan(step, traced.enter(start), controls[0][:, None])[1]
@@ -80,7 +80,7 @@ def executed(session: Session, preset: PresetName, target: np.ndarray, seed: int
     return Kicked(target, execution.states[0], np.concatenate([np.stack(execution.controls), after]))
 
 
-def astray(scene: Scene, kicked: Kicked, players: dict[Engine, Player]) -> list[report.Row]:
+def replay_errors(scene: Scene, kicked: Kicked, players: dict[Engine, Player]) -> list[report.Row]:
     """Return each engine's errors against MuJoCo's limit; no rows where the limit has no contact with the ball.
 
     Contact must come at least `BEFORE_CONTACT` steps after the start.
@@ -93,19 +93,21 @@ def astray(scene: Scene, kicked: Kicked, players: dict[Engine, Player]) -> list[
     contact = strike_step(states, states[:1, -1])
     if contact is None or contact < BEFORE_CONTACT:
         return []
-    passing = contact + int(np.linalg.norm(states[contact:, -1, packed.POSITION] - kicked.target, axis=-1).argmin())
+    passing_step = contact + int(
+        np.linalg.norm(states[contact:, -1, packed.POSITION] - kicked.target, axis=-1).argmin()
+    )
     begin, launch = contact - BEFORE_CONTACT, contact + LAUNCH_STEPS
-    place, velocity = states[passing, -1, packed.POSITION], states[launch, -1, packed.VELOCITY]
+    place, velocity = states[passing_step, -1, packed.POSITION], states[launch, -1, packed.VELOCITY]
     rows = []
     for (engine, substeps), play in players.items():
         path = play(start, controls)
-        left = play(states[begin : begin + 1], controls[:, begin:launch])[-1, 3:]
+        launched = play(states[begin : begin + 1], controls[:, begin:launch])[-1, 3:]
         rows.append(
             {
                 "engine": engine,
                 "substeps": substeps,
-                "error_m": float(np.linalg.norm(path[passing - 1, :3] - place)),
-                "launch_error": float(np.linalg.norm(left - velocity) / np.linalg.norm(velocity)),
+                "error_m": float(np.linalg.norm(path[passing_step - 1, :3] - place)),
+                "launch_error": float(np.linalg.norm(launched - velocity) / np.linalg.norm(velocity)),
             }
         )
     return rows
@@ -119,21 +121,21 @@ def summarise(kicks: Iterable[list[report.Row]]) -> list[report.Row]:
     by_engine: dict[Engine, list[report.Row]] = {}
     for row in chain.from_iterable(kicks):
         by_engine.setdefault((row["engine"], row["substeps"]), []).append(row)
-    found = []
+    summaries = []
     for (engine, substeps), rows in by_engine.items():
         errors = np.array([(row["error_m"], row["launch_error"]) for row in rows])
-        kept = np.isfinite(errors).all(axis=1)
-        errors[~kept] = np.inf
+        is_finite = np.isfinite(errors).all(axis=1)
+        errors[~is_finite] = np.inf
         median, launch = np.median(errors, axis=0)
-        found.append(
+        summaries.append(
             {
                 "engine": engine,
                 "substeps": substeps,
                 "kicks": len(rows),
-                "diverged": int((~kept).sum()),
-                "mean_m": float(errors[kept, 0].mean()) if kept.any() else None,
+                "diverged": int((~is_finite).sum()),
+                "mean_m": float(errors[is_finite, 0].mean()) if is_finite.any() else None,
                 "median_m": float(median) if np.isfinite(median) else None,
                 "launch_error": float(launch) if np.isfinite(launch) else None,
             }
         )
-    return found
+    return summaries

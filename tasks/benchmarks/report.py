@@ -54,17 +54,17 @@ def collect(path: Path, command: str, jobs: Mapping[str, Callable[[], Row]]) -> 
     estimated time left.
     """
     made_by = {"command": command, "hardware": hardware(), "version": version()}
-    kept = _partial(path)
-    done = _rows_of(kept, made_by)
+    path_of_rows = _partial(path)
+    done = _rows_of(path_of_rows, made_by)
     console = Console(stderr=True)
     if done:
-        console.print(f"{len(done)} of {len(jobs)} rows are kept in {kept}")
+        console.print(f"{len(done)} of {len(jobs)} rows are kept in {path_of_rows}")
     begin, fresh = time.monotonic(), 0
     for name, job in jobs.items():
         if name in done:
             continue
         done[name] = job()
-        write_whole(kept, (json.dumps({"made_by": made_by, "rows": done}) + "\n").encode())
+        write_whole(path_of_rows, (json.dumps({"made_by": made_by, "rows": done}) + "\n").encode())
         fresh += 1
         left = (time.monotonic() - begin) / fresh * (len(jobs) - len(done))
         console.print(f"{len(done)} of {len(jobs)}: {name}; {_duration(left)} left", highlight=False, soft_wrap=True)
@@ -75,11 +75,11 @@ def _partial(path: Path) -> Path:
     return path.with_suffix(".partial.json")
 
 
-def _rows_of(kept: Path, made_by: Mapping[str, str]) -> dict[str, Row]:
+def _rows_of(path: Path, made_by: Mapping[str, str]) -> dict[str, Row]:
     """Return the rows by name that a run of the same kind saved; none where there was no such run."""
     try:
-        found = json.loads(kept.read_text())
-        return dict(found["rows"]) if found["made_by"] == made_by else {}
+        saved = json.loads(path.read_text())
+        return dict(saved["rows"]) if saved["made_by"] == made_by else {}
     except (OSError, ValueError, KeyError, TypeError):
         return {}
 
@@ -92,10 +92,10 @@ def _duration(seconds: float) -> str:
 def _git(*arguments: str) -> str:
     """Return the output of a git command in this project."""
     try:
-        found = subprocess.run(["git", *arguments], cwd=PROJECT, capture_output=True, text=True, check=True)
+        result = subprocess.run(["git", *arguments], cwd=PROJECT, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError) as error:
         raise InputError(f"publish is set, but git does not know {PROJECT.name}: {error}") from None
-    return found.stdout.strip()
+    return result.stdout.strip()
 
 
 def version() -> str:
@@ -114,8 +114,8 @@ def hardware() -> str:
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
-        found = re.search(r"model name\s*:\s*(.+)", cpuinfo.read_text())
-        model = found.group(1) if found else model
+        match = re.search(r"model name\s*:\s*(.+)", cpuinfo.read_text())
+        model = match.group(1) if match else model
     accelerators = [device.device_kind for device in jax.devices() if device.platform != "cpu"]
     extra = f", {accelerators[0]}" if accelerators else ""
     return f"{model}, {cores()} cores{extra}, jax {jax.__version__}"

@@ -56,11 +56,11 @@ STYLES = {"spring": "--", "positional": ":"}
 COLOURS = {"larp": "#d55e00", "mujoco": "#0072b2", "mjx": "#009e73", "brax": "#cc79a7", "bullet": "#7f7f7f"}
 
 
-def listed(name: str, text: str, known: tuple[str, ...]) -> list[str]:
+def listed(name: str, text: str, options: tuple[str, ...]) -> list[str]:
     """Return the words between commas; raise InputError for one that is not known."""
     words = [word.strip() for word in text.split(",")]
-    if odd := [word for word in words if word not in known]:
-        raise InputError(f"{name} has {odd[0]!r}, but can have {', '.join(known)}, with commas between them")
+    if odd := [word for word in words if word not in options]:
+        raise InputError(f"{name} has {odd[0]!r}, but can have {', '.join(options)}, with commas between them")
     return words
 
 
@@ -79,7 +79,7 @@ def variants(engine: str) -> list[str]:
 
 def questions(scenes: list[str], engines: list[str], sizes: list[int], seed: int) -> Iterator[Question]:
     """Yield the questions of all rows; of one engine in one case the smaller batch comes first."""
-    cases = [each for scene in scenes for each in CASES[scene]]
+    cases = [scene_case for scene in scenes for scene_case in CASES[scene]]
     for engine in engines:
         for name, (scene, reach), substeps in product(variants(engine), cases, SUBSTEPS[engine]):
             for size in sizes if engine not in ALONE else (1,):
@@ -94,7 +94,7 @@ def questions(scenes: list[str], engines: list[str], sizes: list[int], seed: int
                 yield Question(name, scene, reach, SUBSTEPS[engine][-1], size, gradient=True, seed=seed)
 
 
-class Asking:
+class QuestionRunner:
     """Runner of questions, each in a process of its own.
 
     Where an engine refused or was slow, later questions that differ only in the batch are not run.
@@ -105,15 +105,15 @@ class Asking:
 
     def __call__(self, question: Question) -> report.Row:
         """Return the row of a question; see `engines.answer`."""
-        row, same = asdict(question) | {"coarse": question.coarse}, replace(question, batch=0)
-        row |= {"refused": self.refused[same]} if same in self.refused else self.asked(question)
+        row, same_but_batch = asdict(question) | {"coarse": question.coarse}, replace(question, batch=0)
+        row |= {"refused": self.refused[same_but_batch]} if same_but_batch in self.refused else self.ask(question)
         if row["refused"] is not None:
-            self.refused[same] = row["refused"]
+            self.refused[same_but_batch] = row["refused"]
         elif row["ms_per_step"] > 1e3 * SLOW:
-            self.refused[same] = f"takes {1e-3 * row['ms_per_step']:.1f} s a step at batch {question.batch}"
+            self.refused[same_but_batch] = f"takes {1e-3 * row['ms_per_step']:.1f} s a step at batch {question.batch}"
         return row
 
-    def asked(self, question: Question) -> report.Row:
+    def ask(self, question: Question) -> report.Row:
         """Return the result of a question's process, or in `refused` the reason why there is none."""
         command = [sys.executable, "-m", "tasks.benchmarks.engines", codec.dumps(asdict(question))]
         most = SECONDS[question.gradient]
@@ -122,8 +122,8 @@ class Asking:
         except subprocess.TimeoutExpired:
             return {"refused": f"took longer than {most:.0f} s"}
         if done.returncode:
-            said = (done.stderr.strip() or "nothing").splitlines()[-1]
-            return {"refused": f"its process ended with code {done.returncode}: {said}"}
+            message = (done.stderr.strip() or "nothing").splitlines()[-1]
+            return {"refused": f"its process ended with code {done.returncode}: {message}"}
         return dict(codec.loads(done.stdout.splitlines()[-1]))
 
 
@@ -153,15 +153,15 @@ def kicks_of(engines: list[replays.Engine], count: int, seed: int) -> dict[str, 
 
     @cache
     def players() -> dict[replays.Engine, replays.Player]:
-        found = {}
+        by_engine = {}
         for engine, substeps in engines:
             with suppress(Exception):  # its row of the speed table gives the reason
-                found[engine, substeps] = replays.player_of(kick.scene, engine, substeps)
-        return found
+                by_engine[engine, substeps] = replays.player_of(kick.scene, engine, substeps)
+        return by_engine
 
     def one(target: np.ndarray, shift: np.ndarray, index: int) -> report.Row:
         kicked = replays.executed(session, PRESET, target, seed + index, shift)
-        return {"target": target.tolist(), "replays": replays.astray(kick.scene, kicked, players())}
+        return {"target": target.tolist(), "replays": replays.replay_errors(kick.scene, kicked, players())}
 
     return {f"kick {index}": partial(one, *random_kick(random), index) for index in range(count)}
 
@@ -178,23 +178,23 @@ def speed_table(rows: list[report.Row], sizes: list[int]) -> Table:
     groups: dict[tuple[str, str, bool], list[report.Row]] = {}
     refusals: dict[tuple[str, str], dict[str, None]] = {}
     for row in rows:
-        what = case(row["scene"], row["reach"])
-        groups.setdefault((label(row), what, row["gradient"]), []).append(row)
-    for (engine, what, gradient), found in groups.items():
-        done = {row["batch"]: row for row in found if row["refused"] is None}
+        case_name = case(row["scene"], row["reach"])
+        groups.setdefault((label(row), case_name, row["gradient"]), []).append(row)
+    for (engine, case_name, gradient), group in groups.items():
+        done = {row["batch"]: row for row in group if row["refused"] is None}
         if not done:
             name = f"{engine}, gradient" if gradient else engine
-            refusals.setdefault((name, found[0]["refused"]), {})[what] = None
+            refusals.setdefault((name, group[0]["refused"]), {})[case_name] = None
             continue
         middle = done[max([size for size in done if size <= MIDDLE] or done)]
-        launch = found[0].get("launch_error")
+        launch = group[0].get("launch_error")
         cells = {size: f"{row['us_per_scene_step']:.3g}" for size, row in done.items()}
         if gradient:
             cells = {size: f"{row['reverse_ms'] / row['forward_ms']:.1f} x forward" for size, row in done.items()}
         seconds, extra = middle["compile_seconds"], middle["peak_memory_mib"] - middle["idle_memory_mib"]
         table.add_row(
             f"{engine}, gradient" if gradient else engine,
-            what,
+            case_name,
             *(cells.get(size, "-") for size in sizes),
             f"{seconds:.1f} s" if seconds else "-",
             f"{extra:.0f} MiB",
@@ -205,7 +205,7 @@ def speed_table(rows: list[report.Row], sizes: list[int]) -> Table:
     return table
 
 
-def accuracy_table(found: list[report.Row]) -> Table:
+def accuracy_table(rows: list[report.Row]) -> Table:
     """Return a table of the errors of replayed kicks beside the time per scene and step."""
     table = Table("engine", "mean", "median", "launch error, median", "diverged", f"us, batch {MIDDLE}")
     table.title = f"Ball's distance from MuJoCo's at {replays.LIMIT} engine steps, where it passes the target"
@@ -213,7 +213,7 @@ def accuracy_table(found: list[report.Row]) -> Table:
     def cell(value: float | None, form: str) -> str:
         return "-" if value is None else form.format(value)
 
-    for row in found:
+    for row in rows:
         table.add_row(
             label(row),
             cell(row["mean_m"], "{:.3f} m"),
@@ -258,10 +258,10 @@ Curve = dict[int, float]
 
 def curves(rows: list[report.Row]) -> dict[str, dict[int, Curve]]:
     """Return the milliseconds per step by engine, engine steps and batch."""
-    found: dict[str, dict[int, Curve]] = {}
+    by_engine: dict[str, dict[int, Curve]] = {}
     for row in rows:
-        found.setdefault(row["engine"], {}).setdefault(row["substeps"], {})[row["batch"]] = row["ms_per_step"]
-    return found
+        by_engine.setdefault(row["engine"], {}).setdefault(row["substeps"], {})[row["batch"]] = row["ms_per_step"]
+    return by_engine
 
 
 def draw(axes: Axes, engine: str, lines: dict[int, Curve]) -> tuple[str, Line2D]:
@@ -280,11 +280,11 @@ def draw(axes: Axes, engine: str, lines: dict[int, Curve]) -> tuple[str, Line2D]
     return name, drawn
 
 
-def accuracy_picture(found: list[report.Row]) -> Figure:
+def accuracy_picture(summaries: list[report.Row]) -> Figure:
     """Plot the error over the time per scene and step; an engine's points are joined, and marked by engine steps."""
     figure = Figure(figsize=(7, 4.8), layout="constrained")
     axes = figure.subplots()
-    priced = [row for row in found if None not in (row["us_per_scene_step"], row["mean_m"], row["median_m"])]
+    priced = [row for row in summaries if None not in (row["us_per_scene_step"], row["mean_m"], row["median_m"])]
     for engine in dict.fromkeys(row["engine"] for row in priced):
         rows = [row for row in priced if row["engine"] == engine]
         price = [row["us_per_scene_step"] for row in rows]
@@ -328,25 +328,28 @@ def main(
         json: where the figures go; the pictures, speed.png and accuracy.png, go beside them.
         publish: put the tables into RESULTS.md and the pictures into docs/.
     """
-    asked, tried = listed("scenes", scenes, tuple(CASES)), listed("engines", engines, tuple(SUBSTEPS))
+    scene_names, engine_names = listed("scenes", scenes, tuple(CASES)), listed("engines", engines, tuple(SUBSTEPS))
     sizes = batches(batch)
     if kicks < 0:
         raise InputError(f"kicks is {kicks}, but must be at least 0")
     report.ready(json, publish)
     prepare_jax()
-    again = replayed_by(tried) if kicks and "human_ball" in asked else []
-    ask = Asking()
-    each = [*questions(asked, tried, sizes, seed), *(price(*engine, seed) for engine in again)]
-    jobs = {question.name: partial(ask, question) for question in each}
-    played = kicks_of(again, kicks, seed) if again else {}
+    replaying = replayed_by(engine_names) if kicks and "human_ball" in scene_names else []
+    runner = QuestionRunner()
+    all_questions = [
+        *questions(scene_names, engine_names, sizes, seed),
+        *(price(*engine, seed) for engine in replaying),
+    ]
+    jobs = {question.name: partial(runner, question) for question in all_questions}
+    played = kicks_of(replaying, kicks, seed) if replaying else {}
     command = (
-        f"python -m tasks.benchmarks.speed --scenes {','.join(asked)} --engines {','.join(tried)} "
+        f"python -m tasks.benchmarks.speed --scenes {','.join(scene_names)} --engines {','.join(engine_names)} "
         f"--batch {','.join(map(str, sizes))} --kicks {kicks} --seed {seed}"
     )
     rows = dict(zip([*jobs, *played], report.collect(json, command, jobs | played), strict=True))
-    found = replays.summarise(rows[name]["replays"] for name in played)
-    launch = {(row["engine"], row["substeps"]): row["launch_error"] for row in found}
-    for row in found:
+    summaries = replays.summarise(rows[name]["replays"] for name in played)
+    launch = {(row["engine"], row["substeps"]): row["launch_error"] for row in summaries}
+    for row in summaries:
         row["us_per_scene_step"] = rows[price(row["engine"], row["substeps"], seed).name].get("us_per_scene_step")
     times = [rows[name] | {"launch_error": launch.get((rows[name]["engine"], rows[name]["substeps"]))} for name in jobs]
     report.write_json(
@@ -356,15 +359,15 @@ def main(
             "hardware": report.hardware(),
             "rows": [row for row in times if not row["gradient"]],
             "gradient": [row for row in times if row["gradient"]],
-            "replays": found,
+            "replays": summaries,
             "kicks": [rows[name] for name in played],
         },
     )
     tables = {"speed": speed_table(times, sizes)}
     pictures = {"speed": speed_picture(times)}
-    if found:
-        tables["accuracy_per_microsecond"] = accuracy_table(found)
-        pictures["accuracy"] = accuracy_picture(found)
+    if summaries:
+        tables["accuracy_per_microsecond"] = accuracy_table(summaries)
+        pictures["accuracy"] = accuracy_picture(summaries)
     for name, figure in pictures.items():
         report.write_picture(json.with_name(f"{name}.png"), figure)
         if publish:

@@ -73,14 +73,16 @@ def planned(planner: Planner, state: Any = None, reference: Any = None) -> tuple
 
 def small_planners() -> list[Row]:
     """Return rows of one-link planners with few candidates, lost candidates, extreme slopes or refused arguments."""
-    found = []
+    rows = []
 
-    def says(value: str, promise: str, planner: Planner, expected: Callable[[Any, Any], bool], **given: Any) -> None:
-        plan, info = planned(planner, **given)
-        seen = f"cost {info.cost:.3g}, {info.finite} of {info.candidates} finite"
-        whole = bool(np.isfinite(plan.knots).all() and np.isfinite(plan.spread).all())
-        held = whole and expected(plan, info)
-        found.append(row("planner", value, promise, seen if whole else "the plan is not finite", held))
+    def check(
+        value: str, promise: str, planner: Planner, expected: Callable[[Any, Any], bool], **arguments: Any
+    ) -> None:
+        plan, info = planned(planner, **arguments)
+        observation = f"cost {info.cost:.3g}, {info.finite} of {info.candidates} finite"
+        is_finite = bool(np.isfinite(plan.knots).all() and np.isfinite(plan.spread).all())
+        passed = is_finite and expected(plan, info)
+        rows.append(row("planner", value, promise, observation if is_finite else "the plan is not finite", passed))
 
     nothing = "the warm start, cost inf, 0 candidates finite"
     lost = lambda plan, info: info.cost == np.inf and info.finite == 0 and not np.asarray(plan.knots).any()  # noqa: E731
@@ -95,21 +97,21 @@ def small_planners() -> list[Row]:
         ("Gauss-Newton, forward", GaussNewton(directions=6, jacobian="forward")),
     )
     for name, optimizers in searches:
-        says(f"all candidates lost, {name}", nothing, toy(Shaky(-1.0), optimizers), lost)
-        says(f"most candidates lost, {name}", better, toy(Shaky(0.05), optimizers), good)
-    says("one candidate", better, toy(Shaky(np.inf), Gradient(steps=8, elites=1)), good)
-    says("the fewest of CEM: 4", better, toy(Shaky(np.inf), CEM(samples=4, rounds=4, elites=2)), good)
-    says("horizon 2, the shortest", better, toy(Shaky(np.inf), horizon=2), good)
-    says("horizon 2000", better, toy(Shaky(np.inf), horizon=2000), good)
+        check(f"all candidates lost, {name}", nothing, toy(Shaky(-1.0), optimizers), lost)
+        check(f"most candidates lost, {name}", better, toy(Shaky(0.05), optimizers), good)
+    check("one candidate", better, toy(Shaky(np.inf), Gradient(steps=8, elites=1)), good)
+    check("the fewest of CEM: 4", better, toy(Shaky(np.inf), CEM(samples=4, rounds=4, elites=2)), good)
+    check("horizon 2, the shortest", better, toy(Shaky(np.inf), horizon=2), good)
+    check("horizon 2000", better, toy(Shaky(np.inf), horizon=2000), good)
     for steepness in (1e8, 1e15, 1e25):
         for name, optimizers in (("Gradient", Gradient(steps=2, elites=1)), searches[-1]):
             steep = toy(Shaky(np.inf, steepness), optimizers)
             promise = "finite knots; cost finite, or inf and 0 finite"
             consistent = lambda plan, info: np.isfinite(info.cost) == (info.finite > 0)  # noqa: E731
-            says(f"a slope of {steepness:g} m/rad, {name}", promise, steep, consistent)
-    wild = np.full((6, 1, 3), np.nan)
-    says("reference of NaN", nothing, toy(Shaky(np.inf)), lost, reference=wild)
-    says(
+            check(f"a slope of {steepness:g} m/rad, {name}", promise, steep, consistent)
+    no_reference = np.full((6, 1, 3), np.nan)
+    check("reference of NaN", nothing, toy(Shaky(np.inf)), lost, reference=no_reference)
+    check(
         "reference at infinity",
         better,
         toy(Shaky(np.inf)),
@@ -118,12 +120,12 @@ def small_planners() -> list[Row]:
     )
     locked = lambda plan, info: not np.asarray(plan.knots).any() and info.finite > 0  # noqa: E731
     for name, optimizers in searches:
-        says(f"spread 0, {name}", "the reference itself", toy(Shaky(np.inf), optimizers, spread=0.0), locked)
+        check(f"spread 0, {name}", "the reference itself", toy(Shaky(np.inf), optimizers, spread=0.0), locked)
 
     coarse = toy(Shaky(np.inf))
     target = jnp.full((6, 1, 3), 0.1234567, jnp.bfloat16)
-    kept = coarse.controls(coarse.init(jax.random.key(0)), target).dtype
-    found.append(row("planner", "reference of bfloat16", "joint targets of 32 bits", str(kept), kept == jnp.float32))
+    dtype = coarse.controls(coarse.init(jax.random.key(0)), target).dtype
+    rows.append(row("planner", "reference of bfloat16", "joint targets of 32 bits", str(dtype), dtype == jnp.float32))
     for value, words, call in (
         ("horizon 1", "knots", lambda: toy(Shaky(0.0), horizon=1)),
         ("one knot", "knots", lambda: toy(Shaky(0.0), knots=1)),
@@ -137,16 +139,16 @@ def small_planners() -> list[Row]:
         ("target of NaN", "target", lambda: check_target((0.0, np.nan, 0.0))),
     ):
         with np.errstate(over="ignore"):
-            found.append(row("planner", value, "refused by name", *refusal(call, words)))
-    return found
+            rows.append(row("planner", value, "refused by name", *refusal(call, words)))
+    return rows
 
 
-def targets(bench: Bench, whole: Any) -> list[Row]:
+def targets(bench: Bench, continued_model: Any) -> list[Row]:
     """Return rows of kick plans to targets, most of which no ball can reach."""
     kick = bench.kick
-    planner = kick.planner(whole, (CEM(samples=16, rounds=2, elites=4),))
+    planner = kick.planner(continued_model, (CEM(samples=16, rounds=2, elites=4),))
     plan = planner.init(jax.random.key(0))
-    found = []
+    rows = []
     ball = kick.start()[-1, :3]
     for name, target, reachable in (
         ("ahead", (4.0, 0.0, 0.5), None),
@@ -163,21 +165,21 @@ def targets(bench: Bench, whole: Any) -> list[Row]:
         window = kick.window(np.array(target))(0)
         after, info = planner.step(plan, kick.start(), window)
         with np.errstate(all="ignore"):
-            missed = kick.missed(info.states, 1, np.array(target)) if np.isfinite(target).all() else np.inf
+            miss = kick.missed(info.states, 1, np.array(target)) if np.isfinite(target).all() else np.inf
         whole_plan = bool(np.isfinite(after.knots).all())
         honest = np.isfinite(info.cost) == (info.finite > 0)
-        right = reachable is None or (missed <= REACHABLE) == reachable
+        right = reachable is None or (miss <= REACHABLE) == reachable
         promise = "a finite plan, cost inf if no candidate is finite"
         promise += "" if reachable is None else f", {'' if reachable else 'not '}within {REACHABLE:g} m of it"
-        seen = f"misses by {missed:.3g} m, cost {info.cost:.3g}, {info.finite} of {info.candidates} finite"
-        found.append(row("target", name, promise, seen, whole_plan and honest and right))
-    return found
+        observation = f"misses by {miss:.3g} m, cost {info.cost:.3g}, {info.finite} of {info.candidates} finite"
+        rows.append(row("target", name, promise, observation, whole_plan and honest and right))
+    return rows
 
 
 def execution(bench: Bench) -> list[Row]:
     """Return rows of plans that are executed in a world whose states do not stay finite."""
     kick = bench.kick
-    found = []
+    rows = []
     still = toy(Shaky(np.inf))
 
     class Lost:
@@ -199,27 +201,27 @@ def execution(bench: Bench) -> list[Row]:
         execute(Lost(), np.zeros((1, 13)), (phase,), 5, jax.random.key(0))
 
     for value, interval in (("lost between two plans", 10), ("lost just before a plan", 3)):
-        seen, held = refusal(partial(carried_out, interval, 0.0), "diverged in step 2")
-        found.append(row("execution", value, "ends at once and names the step", seen, held))
+        observation, passed = refusal(partial(carried_out, interval, 0.0), "diverged in step 2")
+        rows.append(row("execution", value, "ends at once and names the step", observation, passed))
     truth = Truth(kick.scene, 1, threads=1)
     for name, change in (("torque of 1e9 N m", 1e9), ("torque of NaN", np.nan)):
         truth.reset(kick.start()[None])
         push = np.full((1, len(kick.scene.links), 3), change)
         states = [truth.step(bench.controls[None, 0], push) for _ in range(3)]
         lost = bool(np.isnan(states[-1]).all())
-        found.append(row("execution", name, "MuJoCo: the row is NaN from there on", "NaN" if lost else "numbers", lost))
-    return found
+        rows.append(row("execution", name, "MuJoCo: the row is NaN from there on", "NaN" if lost else "numbers", lost))
+    return rows
 
 
-def seen_by(jobs: dict[str, Callable[[], list[Row]]]) -> dict[str, Callable[[], Row]]:
+def caught(jobs: dict[str, Callable[[], list[Row]]]) -> dict[str, Callable[[], Row]]:
     """Wrap jobs of several rows each for `report.collect`; a job that crashes gives a row that did not hold."""
 
     def together(name: str, job: Callable[[], list[Row]]) -> Row:
         try:
             return {"rows": job()}
         except Exception as error:
-            seen = f"{type(error).__name__}: {str(error).splitlines()[0][:120]}" if str(error) else repr(error)
-            return {"rows": [row("crash", name, "ends", seen, False)]}
+            observation = f"{type(error).__name__}: {str(error).splitlines()[0][:120]}" if str(error) else repr(error)
+            return {"rows": [row("crash", name, "ends", observation, False)]}
 
     return {name: partial(together, name, job) for name, job in jobs.items()}
 
@@ -236,10 +238,12 @@ def picture(rows: list[Row], title: str) -> Figure:
     most = max(sum(row["axis"] == name for row in rows) for name in axes_names)
     for axes, names in zip(figure.subplots(1, 2), (axes_names[:half], axes_names[half:]), strict=True):
         for place, name in enumerate(names):
-            held = [row["held"] for row in rows if row["axis"] == name]
+            passed = [row["held"] for row in rows if row["axis"] == name]
             # Cases that held come first, so that their share is visible.
-            held.sort(reverse=True)
-            axes.scatter(range(len(held)), [place] * len(held), c=[COLOURS[h] for h in held], marker="s", s=26)
+            passed.sort(reverse=True)
+            axes.scatter(
+                range(len(passed)), [place] * len(passed), c=[COLOURS[value] for value in passed], marker="s", s=26
+            )
         axes.set_yticks(range(len(names)), names)
         axes.set(xlim=(-1, most), ylim=(half - 0.4, -0.6), xlabel="cases: blue held, orange not")
         axes.spines[["top", "right", "left"]].set_visible(False)
@@ -273,8 +277,8 @@ def main(
     report.ready(json, publish, weights)
     prepare_jax()
     kick = Kick.standard()
-    whole = models_of(kick.scene, "larp", weights).whole
-    bench = Bench(kick, whole.dynamics)  # type: ignore[attr-defined]
+    continued_model = models_of(kick.scene, "larp", weights).whole
+    bench = Bench(kick, continued_model.dynamics)  # type: ignore[attr-defined]
 
     def scene_rows(kind: str) -> list[Row]:
         model = bench.model if kind == "human and ball" else Simulator.of_physics(stress.drawn(kind, None))
@@ -296,15 +300,15 @@ def main(
         "horizons": partial(stress.horizons, bench),
         "capsules": stress.geometry,
         "planners": small_planners,
-        "targets": partial(targets, bench, whole),
+        "targets": partial(targets, bench, continued_model),
         "execution": partial(execution, bench),
         "gradients of steps": partial(gradients.of_steps, bench, states, seed),
         "slopes of a ball": partial(gradients.ball_slopes, bench),
-        "gradients of kicks": partial(gradients.of_kicks, bench, whole, 64, seed),
+        "gradients of kicks": partial(gradients.of_kicks, bench, continued_model, 64, seed),
     }
     jobs |= {f"random scenes: {kind}": partial(scene_rows, kind) for kind in stress.KINDS}
     command = f"python -m tasks.benchmarks.stability --scenes {scenes} --seed {seed} --states {states}"
-    rows = [each for found in report.collect(json, command, seen_by(jobs)) for each in found["rows"]]
+    rows = [each for found in report.collect(json, command, caught(jobs)) for each in found["rows"]]
     held = sum(each["held"] for each in rows)
     content = {"command": command, "hardware": report.hardware(), "cases": len(rows), "held": held, "rows": rows}
     report.write_json(json, content)

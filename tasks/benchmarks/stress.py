@@ -1,6 +1,7 @@
 """Stress cases of the simulator and the engine: sizes, states, precision, batches, horizons, geometry, scenes.
 
-Cases are rows {axis, value, promise, seen, held}; a promise is a quantitative bound that can be violated.
+Cases are rows {axis, value, promise, seen: the observation, held: whether the promise was kept}; a promise is a
+quantitative bound that can be violated.
 """
 
 from __future__ import annotations
@@ -61,9 +62,9 @@ class Bench(NamedTuple):
         return self.kick.reference.window(0, STEPS)[1]
 
 
-def row(axis: str, value: Any, promise: str, seen: str, held: bool) -> Row:
+def row(axis: str, value: Any, promise: str, observation: str, passed: bool) -> Row:
     """Return the row of one case."""
-    return {"axis": axis, "value": str(value), "promise": promise, "seen": seen, "held": bool(held)}
+    return {"axis": axis, "value": str(value), "promise": promise, "seen": observation, "held": bool(passed)}
 
 
 def fastest(states: np.ndarray) -> float:
@@ -79,36 +80,38 @@ def sound(states: np.ndarray) -> np.ndarray:
 
 def bounded(axis: str, value: Any, states: np.ndarray) -> Row:
     """Check that a trajectory (H, L, 13) stays finite, with bounded speeds and unit quaternions, until flagged."""
-    kept = np.asarray(sound(states), float)
-    speed = fastest(kept)
-    unit = float(np.abs(np.linalg.norm(kept[..., packed.ORIENTATION], axis=-1) - 1.0).max(initial=0.0))
-    held = bool(np.isfinite(kept).all() and speed <= FASTEST and unit <= 1e-3)
+    sound_states = np.asarray(sound(states), float)
+    speed = fastest(sound_states)
+    unit = float(np.abs(np.linalg.norm(sound_states[..., packed.ORIENTATION], axis=-1) - 1.0).max(initial=0.0))
+    passed = bool(np.isfinite(sound_states).all() and speed <= FASTEST and unit <= 1e-3)
     promise = f"LARP: finite, quaternions of unit length, no link beyond {FASTEST:g} m/s, or flagged from there on"
-    until = f", flagged after {len(kept)} steps" if len(kept) < len(states) else ""
-    return row(axis, value, promise, f"fastest {speed:.3g} m/s, quaternions off by {unit:.0e}{until}", held)
+    until = f", flagged after {len(sound_states)} steps" if len(sound_states) < len(states) else ""
+    return row(axis, value, promise, f"fastest {speed:.3g} m/s, quaternions off by {unit:.0e}{until}", passed)
 
 
 def flagged(axis: str, value: Any, states: np.ndarray, flag: bool) -> Row:
     """Check that the engine flags a trajectory (H, L, 13) that is not finite."""
-    whole = bool(np.isfinite(states).all())
-    seen = "finite, not flagged" if whole and flag else "flagged" if not flag else "not finite and not flagged"
-    return row(axis, value, "MuJoCo: finite, or flagged as diverged", seen, whole or not flag)
+    is_finite = bool(np.isfinite(states).all())
+    observation = (
+        "finite, not flagged" if is_finite and flag else "flagged" if not flag else "not finite and not flagged"
+    )
+    return row(axis, value, "MuJoCo: finite, or flagged as diverged", observation, is_finite or not flag)
 
 
 # Sizes.
 
 
-def scaled(scene: Scene, body: str, field: str, factor: float) -> Scene:
+def scaled(scene: Scene, name: str, field: str, factor: float) -> Scene:
     """Return the scene with one size of all links of a body times a factor; motors and surfaces stay."""
 
-    def resized(each: Any) -> Any:
-        if each.name != body:
-            return each
+    def resized(body: Any) -> Any:
+        if body.name != name:
+            return body
         return replace(
-            each, links=tuple(replace(link, **{field: factor * getattr(link, field)}) for link in each.links)
+            body, links=tuple(replace(link, **{field: factor * getattr(link, field)}) for link in body.links)
         )
 
-    return replace(scene, bodies=tuple(resized(each) for each in scene.bodies))
+    return replace(scene, bodies=tuple(resized(body) for body in scene.bodies))
 
 
 def standing(scene: Scene, state: np.ndarray) -> np.ndarray:
@@ -129,36 +132,36 @@ def standing(scene: Scene, state: np.ndarray) -> np.ndarray:
 
 def sizes(bench: Bench, body: str, field: str) -> list[Row]:
     """Return rows of one size of the human or the ball, from a tenth to ten times its own."""
-    scene, rows = bench.kick.scene, bench.kick.scene.rows(body)
-    scenes = [scaled(scene, body, field, factor) for factor in FACTORS]
-    starts = np.stack([standing(each, bench.kick.start()) for each in scenes])
+    scene, link_rows = bench.kick.scene, bench.kick.scene.rows(body)
+    sized_scenes = [scaled(scene, body, field, factor) for factor in FACTORS]
+    starts = np.stack([standing(sized, bench.kick.start()) for sized in sized_scenes])
     controls = np.broadcast_to(bench.controls, (len(FACTORS), *bench.controls.shape))
-    morphology = jnp.stack([kinematics.morphology_of(each) for each in scenes])
+    morphology = jnp.stack([kinematics.morphology_of(sized) for sized in sized_scenes])
     states = np.asarray(jax.jit(bench.model.rollout)(starts, controls, morphology=morphology))
     apart = np.asarray(jax.jit(lambda s: kinematics.displacement(scene, s, morphology[:, None]))(jnp.asarray(states)))
-    errors, found = [], []
-    for index, (factor, each) in enumerate(zip(FACTORS, scenes, strict=True)):
-        true, flags = Truth(each, 1, threads=1).rollout(starts[index][None], controls[index][None])
-        distance = np.linalg.norm((states[index] - true[0])[:, rows, packed.POSITION], axis=-1)
+    errors, rows = [], []
+    for index, (factor, sized) in enumerate(zip(FACTORS, sized_scenes, strict=True)):
+        true, flags = Truth(sized, 1, threads=1).rollout(starts[index][None], controls[index][None])
+        distance = np.linalg.norm((states[index] - true[0])[:, link_rows, packed.POSITION], axis=-1)
         errors.append(float(distance.mean()) if flags[0] and np.isfinite(distance).all() else np.inf)
         if factor in (0.1, 0.2, 0.5, 2.0, 5.0, 10.0):
-            found.append(bounded(f"{body} {field}", f"x {factor:g}", states[index]))
-            found.append(flagged(f"{body} {field}", f"x {factor:g}", true[0], bool(flags[0])))
+            rows.append(bounded(f"{body} {field}", f"x {factor:g}", states[index]))
+            rows.append(flagged(f"{body} {field}", f"x {factor:g}", true[0], bool(flags[0])))
             if body == "human":
                 opened = float(np.linalg.norm(apart[index][: len(sound(states[index]))], axis=-1).max(initial=0.0))
                 promise = f"LARP: joints stay closed within {100 * CLOSED:g} cm for {STEPS} steps, or until flagged"
-                seen = f"{100 * opened:.3g} cm"
-                found.append(row(f"{body} {field}", f"x {factor:g}", promise, seen, opened <= CLOSED))
+                observation = f"{100 * opened:.3g} cm"
+                rows.append(row(f"{body} {field}", f"x {factor:g}", promise, observation, opened <= CLOSED))
     within = [error <= NEAR_TRUTH for error in errors]
     unit = FACTORS.index(1.0)
-    low = unit - next((n for n, held in enumerate(within[unit::-1]) if not held), unit + 1) + 1
-    high = unit + next((n for n, held in enumerate(within[unit:]) if not held), len(FACTORS) - unit) - 1
+    low = unit - next((n for n, passed in enumerate(within[unit::-1]) if not passed), unit + 1) + 1
+    high = unit + next((n for n, passed in enumerate(within[unit:]) if not passed), len(FACTORS) - unit) - 1
     limit = f"holds from x {FACTORS[low]:g} to x {FACTORS[high]:g}" if within[unit] else "holds nowhere"
     promise = f"LARP: links of the {body} within {100 * NEAR_TRUTH:g} cm of MuJoCo's on average over {STEPS} steps"
-    for factor, error, held in zip(FACTORS, errors, within, strict=True):
+    for factor, error, passed in zip(FACTORS, errors, within, strict=True):
         if factor in (0.1, 0.5, 0.8, 1.25, 2.0, 10.0):
-            found.append(row(f"{body} {field}", f"x {factor:g}", promise, f"{100 * error:.3g} cm; {limit}", held))
-    return found
+            rows.append(row(f"{body} {field}", f"x {factor:g}", promise, f"{100 * error:.3g} cm; {limit}", passed))
+    return rows
 
 
 # States.
@@ -227,9 +230,14 @@ def cases(kick: Kick, controls: np.ndarray) -> list[Case]:
 
         add("ball speed at the foot", f"{speed:g} m/s", shot)
         add("speed of every link", f"{speed:g} m/s", put(links, packed.VELOCITY, (0.6 * speed, 0.0, 0.8 * speed)))
-    for spin in (10.0, 50.0, 100.0, 200.0):
-        add("ball spin on the ground", f"{spin:g} rad/s", put(-1, packed.ANGULAR_VELOCITY, (0.0, spin, 0.0)), law=law)
-        add("spin of every link", f"{spin:g} rad/s", put(links, packed.ANGULAR_VELOCITY, spin * toss))
+    for angular_speed in (10.0, 50.0, 100.0, 200.0):
+        add(
+            "ball spin on the ground",
+            f"{angular_speed:g} rad/s",
+            put(-1, packed.ANGULAR_VELOCITY, (0.0, angular_speed, 0.0)),
+            law=law,
+        )
+        add("spin of every link", f"{angular_speed:g} rad/s", put(links, packed.ANGULAR_VELOCITY, angular_speed * toss))
     nothing = lambda state: None  # noqa: E731
     for torque in (10.0, 100.0, 1e3, 1e4):
         add("torque on every link", f"{torque:g} N m", nothing, torque=torque)
@@ -281,20 +289,20 @@ def _upside_down(state: np.ndarray) -> None:
 def wild_states(bench: Bench) -> list[Row]:
     """Return rows of all `cases`, in LARP and in MuJoCo."""
     scene = bench.kick.scene
-    every = cases(bench.kick, bench.controls)
-    states = np.stack([case.state for case in every])
-    controls = np.stack([case.controls for case in every])
-    torques = np.zeros((len(every), STEPS, len(scene.links), 3))
-    torques[:, :, :, 1] = np.array([case.torque for case in every])[:, None, None]
+    all_cases = cases(bench.kick, bench.controls)
+    states = np.stack([case.state for case in all_cases])
+    controls = np.stack([case.controls for case in all_cases])
+    torques = np.zeros((len(all_cases), STEPS, len(scene.links), 3))
+    torques[:, :, :, 1] = np.array([case.torque for case in all_cases])[:, None, None]
     learned = np.asarray(jax.jit(lambda s, u, t: bench.model.rollout(s, u, torques=t))(states, controls, torques))
-    true, flags = Truth(scene, len(every)).rollout(states, controls, torques)
-    found = []
-    for case, start, mine, theirs, flag in zip(every, states, learned, true, flags, strict=True):
-        found.append(bounded(case.axis, case.value, mine))
+    true, flags = Truth(scene, len(all_cases)).rollout(states, controls, torques)
+    rows = []
+    for case, start, predicted, true_states, flag in zip(all_cases, states, learned, true, flags, strict=True):
+        rows.append(bounded(case.axis, case.value, predicted))
         if case.law:
-            found.append(row(case.axis, case.value, *case.law(start, sound(mine))))
-        found.append(flagged(case.axis, case.value, theirs, bool(flag)))
-    return found
+            rows.append(row(case.axis, case.value, *case.law(start, sound(predicted))))
+        rows.append(flagged(case.axis, case.value, true_states, bool(flag)))
+    return rows
 
 
 def far_and_lost(bench: Bench) -> list[Row]:
@@ -324,24 +332,26 @@ def far_and_lost(bench: Bench) -> list[Row]:
     after = np.asarray(run(states, controls))
     alone = np.asarray(run(np.tile(base, (len(states), 1, 1)), controls))
     apart = np.abs(after - alone)[..., packed.POSITION].max(axis=(1, 3))  # (N, L)
-    found = []
+    report_rows = []
     for index, distance in enumerate(distances):
-        moved, whole = float(apart[index][human].max()), bool(np.isfinite(after[index]).all())
+        moved, is_finite = float(apart[index][human].max()), bool(np.isfinite(after[index]).all())
         promise = f"LARP: the human within 1 mm of where it is with a ball 3 m away, {STEPS} steps; or not finite"
-        seen = f"{1e3 * moved:.2g} mm" if whole else "not finite"
-        found.append(row("ball far away", f"{distance:g} m", promise, seen, moved <= 1e-3 or not whole))
+        observation = f"{1e3 * moved:.2g} mm" if is_finite else "not finite"
+        report_rows.append(
+            row("ball far away", f"{distance:g} m", promise, observation, moved <= 1e-3 or not is_finite)
+        )
     beside = float(apart[-1].max())
     for index, name in enumerate(lost, start=len(distances)):
-        whole = bool(np.isfinite(after[index]).all())
+        is_finite = bool(np.isfinite(after[index]).all())
         promise = f"LARP: this row is not finite; a healthy row beside it within 1 mm of without, {STEPS} steps"
-        seen = f"{'finite' if whole else 'not finite'}, beside it {1e3 * beside:.2g} mm"
-        found.append(row("state that is no state", name, promise, seen, not whole and beside <= 1e-3))
-    return found
+        observation = f"{'finite' if is_finite else 'not finite'}, beside it {1e3 * beside:.2g} mm"
+        report_rows.append(row("state that is no state", name, promise, observation, not is_finite and beside <= 1e-3))
+    return report_rows
 
 
 def offsets(bench: Bench) -> list[Row]:
     """Return rows of a kick that is shifted along the ground: predictions must shift too, within precision."""
-    found = []
+    rows = []
     for bits, places in ((32, (10.0, 100.0, 1e3, 1e4)), (64, (1e4, 1e6))):
         with jax.enable_x64(bits == 64):
             model = in_double(bench.model) if bits == 64 else bench.model
@@ -355,14 +365,14 @@ def offsets(bench: Bench) -> list[Row]:
             shifted[..., 0] -= place
             moved = float(np.abs(shifted[..., packed.POSITION]).max())
             promise = f"LARP: {STEPS} steps shift with the world, within 1 cm"
-            found.append(row("offset", f"{place:g} m, float{bits}", promise, f"{100 * moved:.2g} cm", moved <= 0.01))
+            rows.append(row("offset", f"{place:g} m, float{bits}", promise, f"{100 * moved:.2g} cm", moved <= 0.01))
     truth = Truth(bench.kick.scene, 1, threads=1)
     for place in (100.0, 1e4):
         start = bench.kick.start()[None]
         start[..., 0] += place
         states, flags = truth.rollout(start, bench.controls[None])
-        found.append(flagged("offset", f"{place:g} m", states[0], bool(flags[0])))
-    return found
+        rows.append(flagged("offset", f"{place:g} m", states[0], bool(flags[0])))
+    return rows
 
 
 # Precision, batches, horizons, geometry.
@@ -375,30 +385,30 @@ def in_double(model: Simulator) -> Simulator:
 
 def precision(bench: Bench) -> list[Row]:
     """Return rows of precision: inputs decide it, and types of too low precision are refused."""
-    found = []
+    rows = []
     start, controls = bench.kick.start()[None], bench.controls[None]
     single = np.asarray(jax.jit(bench.model.rollout)(start, controls))
     with jax.enable_x64(True):
         model = in_double(bench.model)
         double = jax.jit(model.rollout)(start, controls)
-        kept = double.dtype == jnp.float64
-        found.append(row("precision", "float64", "LARP: 64 bits in, 64 bits out", str(double.dtype), kept))
+        is_double = double.dtype == jnp.float64
+        rows.append(row("precision", "float64", "LARP: 64 bits in, 64 bits out", str(double.dtype), is_double))
         mixed = bench.model.rollout(jnp.asarray(start, jnp.float32), jnp.asarray(controls[:, :2]))
-        said = "LARP: 32 bits in, 32 bits out, where JAX holds 64 too"
-        found.append(row("precision", "float32 beside float64", said, str(mixed.dtype), mixed.dtype == jnp.float32))
+        promise = "LARP: 32 bits in, 32 bits out, where JAX holds 64 too"
+        rows.append(row("precision", "float32 beside float64", promise, str(mixed.dtype), mixed.dtype == jnp.float32))
         error = np.linalg.norm((np.asarray(double) - single)[..., packed.POSITION], axis=-1)[0]
     for steps, limit in ((10, 1e-3), (STEPS, 1e-2)):
         worst = float(error[:steps].max())
         promise = f"LARP: within {1e3 * limit:g} mm of float64 for {steps} steps"
-        found.append(row("precision", f"float32, {steps} steps", promise, f"{1e3 * worst:.2g} mm", worst <= limit))
+        rows.append(row("precision", f"float32, {steps} steps", promise, f"{1e3 * worst:.2g} mm", worst <= limit))
     for kind in (jnp.bfloat16, jnp.float16, jnp.int32):
         for name, call in (
             ("step", partial(bench.model.step, control=jnp.asarray(controls[:, 0]))),
             ("rollout", partial(bench.model.rollout, controls=jnp.asarray(controls))),
         ):
-            seen, held = refusal(partial(call, jnp.asarray(start, kind)), "state has numbers of type")
-            found.append(row("precision", f"{kind.__name__}, {name}", "LARP: refused by name", seen, held))
-    return found
+            observation, passed = refusal(partial(call, jnp.asarray(start, kind)), "state has numbers of type")
+            rows.append(row("precision", f"{kind.__name__}, {name}", "LARP: refused by name", observation, passed))
+    return rows
 
 
 def refusal(call: Callable[[], Any], words: str) -> tuple[str, bool]:
@@ -414,7 +424,7 @@ def refusal(call: Callable[[], Any], words: str) -> tuple[str, bool]:
 
 def batches(bench: Bench) -> list[Row]:
     """Return rows of one step of 1 to 8192 states, each row compared with the same state alone."""
-    found = []
+    rows = []
     count = 8192
     random = np.random.default_rng(1)
     starts = np.tile(bench.kick.reference.states[0], (count, 1, 1)).astype(np.float32)
@@ -424,12 +434,12 @@ def batches(bench: Bench) -> list[Row]:
     alone = np.concatenate([np.asarray(run(starts[i : i + 1], controls[i : i + 1])) for i in range(8)])
     for size in (1, 2, 16, 256, 2048, count):
         after = np.asarray(run(starts[:size], controls[:size]))
-        rows = min(size, len(alone))
-        worst = float(np.abs(after[:rows] - alone[:rows]).max())
+        compared = min(size, len(alone))
+        worst = float(np.abs(after[:compared] - alone[:compared]).max())
         promise = "LARP: finite, and every row as alone within 1e-3 (m, m/s, rad/s)"
-        seen = f"off by {worst:.1e}"
-        found.append(row("batch", size, promise, seen, bool(np.isfinite(after).all() and worst <= 1e-3)))
-    return found
+        observation = f"off by {worst:.1e}"
+        rows.append(row("batch", size, promise, observation, bool(np.isfinite(after).all() and worst <= 1e-3)))
+    return rows
 
 
 def horizons(bench: Bench) -> list[Row]:
@@ -441,19 +451,19 @@ def horizons(bench: Bench) -> list[Row]:
     true, _ = Truth(scene, 1, threads=1).rollout(kick.start()[None], controls)
     morphology = kinematics.morphology_of(scene)[None]
     apart = np.linalg.norm(np.asarray(kinematics.displacement(scene, jnp.asarray(states), morphology)), axis=-1)
-    found = []
+    rows = []
     for steps in (100, 1_000, 5_000, length):
         part = sound(states[:steps])
-        found.append(bounded("horizon", f"{steps} steps", states[:steps]))
+        rows.append(bounded("horizon", f"{steps} steps", states[:steps]))
         opened = float(apart[: len(part)].max(initial=0.0))
         promise = f"LARP: joints stay closed within {100 * CLOSED:g} cm, or until flagged"
-        found.append(row("horizon", f"{steps} steps", promise, f"{100 * opened:.2g} cm", opened <= CLOSED))
+        rows.append(row("horizon", f"{steps} steps", promise, f"{100 * opened:.2g} cm", opened <= CLOSED))
         sunk = float(np.abs(part[-1, -1, 2] - scene.links[-1].radius))
         promise = "LARP: the ball lies on the ground within 1 cm at the end, or when flagged"
         if steps >= 1_000:
-            found.append(row("horizon", f"{steps} steps", promise, f"{100 * sunk:.2g} cm", sunk <= 0.01))
-        found.append(flagged("horizon", f"{steps} steps", true[0, :steps], bool(truth_finite(true[:, :steps])[0])))
-    return found
+            rows.append(row("horizon", f"{steps} steps", promise, f"{100 * sunk:.2g} cm", sunk <= 0.01))
+        rows.append(flagged("horizon", f"{steps} steps", true[0, :steps], bool(truth_finite(true[:, :steps])[0])))
+    return rows
 
 
 def geometry() -> list[Row]:
@@ -484,7 +494,7 @@ def geometry() -> list[Row]:
         )
         return closest(one, two).distance[0, 0, 0]
 
-    found = []
+    rows = []
     for bits in (32, 64):
         with jax.enable_x64(bits == 64):
             numbers = jnp.asarray(places)
@@ -494,9 +504,9 @@ def geometry() -> list[Row]:
         apart = np.abs(np.asarray(reverse) - np.asarray(forward)).max(axis=(1, 2))
         promise = "distance right within 1e-5, gradients finite, reverse = forward within 1e-5"
         for name, wrong, differ in zip(pairs, off, apart, strict=True):
-            seen = f"distance off by {wrong:.0e}, gradients by {differ:.0e}"
-            found.append(row("capsules", f"{name}, float{bits}", promise, seen, wrong <= 1e-5 and differ <= 1e-5))
-    return found
+            observation = f"distance off by {wrong:.0e}, gradients by {differ:.0e}"
+            rows.append(row("capsules", f"{name}, float{bits}", promise, observation, wrong <= 1e-5 and differ <= 1e-5))
+    return rows
 
 
 # Random scenes.
@@ -515,7 +525,7 @@ def drawn(kind: str, random: np.random.Generator | None) -> Scene:
         if random is None:
             return human(name)
         segments = ("torso", "upper_arm", "thigh", "shin", "foot")
-        lengths, radii = ({each: float(random.uniform(0.3, 3.0)) for each in segments} for _ in range(2))
+        lengths, radii = ({segment: float(random.uniform(0.3, 3.0)) for segment in segments} for _ in range(2))
         return human(name, float(random.uniform(0.3, 3.0)), size(70.0), lengths, radii)
 
     def round_one(name: str) -> Any:
@@ -537,10 +547,10 @@ def drawn(kind: str, random: np.random.Generator | None) -> Scene:
     if len(chosen) == 1:
         return Scene(chosen)
     first, second = chosen
-    one, two = (
-        kicking_links(each) if each.kind == "human" else tuple(link.name for link in each.links) for each in chosen
+    first_links, second_links = (
+        kicking_links(body) if body.kind == "human" else tuple(link.name for link in body.links) for body in chosen
     )
-    return Scene(chosen, (Pair(first.name, second.name, one, two, ball().surface),))
+    return Scene(chosen, (Pair(first.name, second.name, first_links, second_links, ball().surface),))
 
 
 def wild(scene: Scene, count: int, random: np.random.Generator) -> np.ndarray:
@@ -562,9 +572,9 @@ def wild(scene: Scene, count: int, random: np.random.Generator) -> np.ndarray:
 
 
 class Tally(NamedTuple):
-    """Counts of states tried and of failures, in random scenes of a kind."""
+    """Counts of states and of failures, in random scenes of a kind."""
 
-    tried: int
+    states: int
     crashes: list[str]
     larp_lost: int  # not finite, and costs infinity
     truth_lost: int  # flagged as diverged
@@ -572,7 +582,7 @@ class Tally(NamedTuple):
     slowest: float  # s, of a scene in the engine
 
 
-def random_scenes(kind: str, model: Simulator, scenes: int, each: int, steps: int, seed: int) -> Tally:
+def random_scenes(kind: str, model: Simulator, scenes: int, states_per_scene: int, steps: int, seed: int) -> Tally:
     """Roll out random sizes and states of one kind of scene, in MuJoCo and in the learned simulator."""
     random = np.random.default_rng((seed, KINDS.index(kind)))
     crashes: list[str] = []
@@ -581,15 +591,19 @@ def random_scenes(kind: str, model: Simulator, scenes: int, each: int, steps: in
     starts, targets, pushes, shapes = [], [], [], []
     for _ in range(scenes):
         scene = drawn(kind, random)
-        state = wild(scene, each, random)
+        state = wild(scene, states_per_scene, random)
         lower, upper = scene.limits
-        share = random.uniform(0.0, 1.0, (each, steps, len(scene.motors), 3))
+        share = random.uniform(0.0, 1.0, (states_per_scene, steps, len(scene.motors), 3))
         control = 2.0 * (lower + share * (upper - lower))
-        torque = 100.0 * random.standard_normal((each, 1, len(scene.links), 3)) * (random.random((each, 1, 1, 1)) < 0.2)
+        torque = (
+            100.0
+            * random.standard_normal((states_per_scene, 1, len(scene.links), 3))
+            * (random.random((states_per_scene, 1, 1, 1)) < 0.2)
+        )
         torque = np.repeat(torque, steps, axis=1)
         begin = time.monotonic()
         try:
-            states, flags = Truth(scene, each).rollout(state, control, torque)
+            states, flags = Truth(scene, states_per_scene).rollout(state, control, torque)
             truth_lost += int((~flags).sum())
             silent += int((flags & ~np.isfinite(states).all(axis=(1, 2, 3))).sum())
         except Exception as error:
@@ -598,7 +612,7 @@ def random_scenes(kind: str, model: Simulator, scenes: int, each: int, steps: in
         starts.append(state)
         targets.append(control)
         pushes.append(torque)
-        shapes.append(np.repeat(np.asarray(kinematics.morphology_of(scene))[None], each, axis=0))
+        shapes.append(np.repeat(np.asarray(kinematics.morphology_of(scene))[None], states_per_scene, axis=0))
     larp_lost = 0
     size = CostTerm("size", lambda states, controls, context: states[:, :, 2])
     try:
@@ -611,17 +625,17 @@ def random_scenes(kind: str, model: Simulator, scenes: int, each: int, steps: in
         silent += int((lost & np.isfinite(costs)).sum())
     except Exception as error:
         crashes.append(f"LARP: {type(error).__name__}: {error}")
-    return Tally(scenes * each, crashes, larp_lost, truth_lost, silent, slowest)
+    return Tally(scenes * states_per_scene, crashes, larp_lost, truth_lost, silent, slowest)
 
 
-def scene_rows(kind: str, model: Simulator, scenes: int, each: int, seed: int) -> list[Row]:
+def scene_rows(kind: str, model: Simulator, scenes: int, states_per_scene: int, seed: int) -> list[Row]:
     """Return rows of random scenes of a kind: no crash, no slow scene, no unflagged divergence."""
-    found = random_scenes(kind, model, scenes, each, 10, seed)
-    value = f"{kind}, {found.tried} states"
-    crashed = f"{len(found.crashes)} crashes" + (f", the first: {found.crashes[0][:80]}" if found.crashes else "")
-    said = f"{found.silent} silent; flagged: LARP {found.larp_lost}, MuJoCo {found.truth_lost}"
+    tally = random_scenes(kind, model, scenes, states_per_scene, 10, seed)
+    value = f"{kind}, {tally.states} states"
+    crashed = f"{len(tally.crashes)} crashes" + (f", the first: {tally.crashes[0][:80]}" if tally.crashes else "")
+    observation = f"{tally.silent} silent; flagged: LARP {tally.larp_lost}, MuJoCo {tally.truth_lost}"
     return [
-        row("random scenes", value, "0 crashes, no scene beyond 60 s", f"{crashed}, slowest {found.slowest:.1f} s",
-            not found.crashes and found.slowest < 60.0),
-        row("random scenes", value, "0 numbers that are not finite without saying so", said, found.silent == 0),
+        row("random scenes", value, "0 crashes, no scene beyond 60 s", f"{crashed}, slowest {tally.slowest:.1f} s",
+            not tally.crashes and tally.slowest < 60.0),
+        row("random scenes", value, "0 numbers that are not finite without saying so", observation, tally.silent == 0),
     ]  # fmt: skip

@@ -52,41 +52,41 @@ class Point:
         if any(self.preset.verify):
             return "verified"
         stages = (*self.preset.first, *self.preset.replan)
-        return "gradient" if any(isinstance(each, GaussNewton | Gradient) for each in stages) else "sampling"
+        return "gradient" if any(isinstance(optimizer, GaussNewton | Gradient) for optimizer in stages) else "sampling"
 
     @property
     def name(self) -> str:
         """Return a name: model, optimisers of first plan and replans, steps between replans, ground-truth trials."""
         preset = self.preset
         model = "larp" if self.dynamics == "larp" else f"mujoco {self.substeps}"
-        trials = ""
+        validation = ""
         if any(preset.verify):
-            trials = ", trials {} / {} of {} to {:g} mm by {}".format(
-                *preset.verify, preset.candidates, 1e3 * preset.tolerance, _told((preset.correct,))
+            validation = ", trials {} / {} of {} to {:g} mm by {}".format(
+                *preset.verify, preset.candidates, 1e3 * preset.tolerance, _text_of((preset.correct,))
             )
-        return f"{model}: {_told(preset.first)} / {_told(preset.replan)} every {preset.interval}{trials}"
+        return f"{model}: {_text_of(preset.first)} / {_text_of(preset.replan)} every {preset.interval}{validation}"
 
 
-def _told(stage: Sequence[Optimizer]) -> str:
+def _text_of(stage: Sequence[Optimizer]) -> str:
     """Return the optimisers as text.
 
     Sampling: samples x rounds. Gradients: elites x steps. Gauss-Newton: directions x rounds, and its derivatives.
     """
 
-    def one(each: Optimizer) -> str:
-        match each:
+    def one(optimizer: Optimizer) -> str:
+        match optimizer:
             case CEM():
-                return f"CEM {each.samples}x{each.rounds}"
+                return f"CEM {optimizer.samples}x{optimizer.rounds}"
             case MPPI():
-                return f"MPPI {each.samples}x{each.rounds}"
+                return f"MPPI {optimizer.samples}x{optimizer.rounds}"
             case Gradient():
-                return f"RMSprop {each.elites}x{each.steps}"
+                return f"RMSprop {optimizer.elites}x{optimizer.steps}"
             case GaussNewton():
-                slopes = "forward" if each.jacobian == "forward" else f"step {each.step:g}"
-                return f"GN {each.directions}x{each.rounds} {slopes}"
+                slopes = "forward" if optimizer.jacobian == "forward" else f"step {optimizer.step:g}"
+                return f"GN {optimizer.directions}x{optimizer.rounds} {slopes}"
             case Fallback():
-                return f"if astray {_told(each.optimizers)}"
-        raise InputError(f"optimizer is {each}, but must be one that has a name here")
+                return f"if astray {_text_of(optimizer.optimizers)}"
+        raise InputError(f"optimizer is {optimizer}, but must be one that has a name here")
 
     return " + ".join(map(one, stage)) or "nothing"
 
@@ -168,37 +168,37 @@ def measure(kick: Kick, point: Point, weights: Path | None, targets: int, seed: 
         spent = sum(info.seconds for info in plans)
         kicks.append(summarize(kick, execution, target) | {"planning_seconds": spent, "first_cost": plans[0].cost})
     jax.clear_caches()  # the next point compiles other programs, and each occupies memory
-    errors = np.array([each["truth_error_m"] for each in kicks])
+    errors = np.array([kick_figures["truth_error_m"] for kick_figures in kicks])
     return {
         "point": point.name,
         "family": point.family,
         "mean_truth_error_m": float(errors.mean()),
         "standard_error_m": float(errors.std(ddof=1) / np.sqrt(len(errors))) if len(errors) > 1 else None,
         "median_truth_error_m": float(np.median(errors)),
-        "first_cost": float(np.mean([each["first_cost"] for each in kicks])),
-        "planning_seconds": float(np.mean([each["planning_seconds"] for each in kicks])),
-        "plan_seconds": float(np.mean([each["plan_seconds"] for each in kicks])),
-        "replan_ms": float(np.median([each["replan_ms"]["p50"] for each in kicks])),
-        "compile_seconds": float(sum(each["compile_seconds"] for each in kicks)),
-        "truth_rollouts": float(np.mean([each["truth_rollouts"] for each in kicks])),
+        "first_cost": float(np.mean([kick_figures["first_cost"] for kick_figures in kicks])),
+        "planning_seconds": float(np.mean([kick_figures["planning_seconds"] for kick_figures in kicks])),
+        "plan_seconds": float(np.mean([kick_figures["plan_seconds"] for kick_figures in kicks])),
+        "replan_ms": float(np.median([kick_figures["replan_ms"]["p50"] for kick_figures in kicks])),
+        "compile_seconds": float(sum(kick_figures["compile_seconds"] for kick_figures in kicks)),
+        "truth_rollouts": float(np.mean([kick_figures["truth_rollouts"] for kick_figures in kicks])),
         "truth_errors_m": errors.tolist(),
     }
 
 
 def front(rows: Sequence[report.Row]) -> list[report.Row]:
     """Return the Pareto front of mean error and planning time, the quickest row first."""
-    best, found = np.inf, []
+    best, best_rows = np.inf, []
     for row in sorted(rows, key=lambda row: (row["planning_seconds"], row["mean_truth_error_m"])):
         if row["mean_truth_error_m"] < best:
             best = row["mean_truth_error_m"]
-            found.append(row)
-    return found
+            best_rows.append(row)
+    return best_rows
 
 
 def beaten(row: report.Row, rows: Sequence[report.Row]) -> list[report.Row]:
     """Return the rows that are better than this one by more than `BETTER` in both mean error and planning time."""
     figures = ("planning_seconds", "mean_truth_error_m")
-    return [other for other in rows if all(other[each] < (1.0 - BETTER) * row[each] for each in figures)]
+    return [other for other in rows if all(other[figure] < (1.0 - BETTER) * row[figure] for figure in figures)]
 
 
 def picture(rows: Sequence[report.Row], presets: dict[str, str], targets: int) -> Figure:
