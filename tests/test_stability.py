@@ -21,7 +21,7 @@ from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from mpc import CEM, Gradient
 from mpc.loop import DivergenceError, Phase, Window, execute
-from tasks.benchmarks import gradients, stability, stress
+from tasks.benchmarks import gradients, promises, random_scenes, stability, stress
 from tasks.motions.references import Reference
 
 
@@ -140,24 +140,24 @@ def test_a_reference_of_bfloat16_becomes_targets_of_32_bits() -> None:
 
 @pytest.mark.parametrize("kind", ["ball", "chain"])
 def test_random_scenes_neither_crash_nor_hide_what_is_not_finite(kind: str) -> None:
-    model = Simulator.of_physics(stress.drawn(kind, None))
-    found = stress.random_scenes(kind, model, scenes=3, states_per_scene=4, steps=3, seed=0)
+    model = Simulator.of_physics(random_scenes.drawn(kind, None))
+    found = random_scenes.random_scenes(kind, model, scenes=3, states_per_scene=4, steps=3, seed=0)
     assert (found.states, found.crashes, found.silent) == (12, [], 0)
 
 
 def test_what_is_hidden_would_be_found() -> None:
     lost, resting = np.full((4, 1, packed.SIZE), np.nan), np.zeros((4, 1, packed.SIZE))
     resting[..., 3] = 1.0
-    assert stress.bounded("axis", "value", resting)["held"]
-    assert "flagged after 2 steps" in stress.bounded("axis", "value", np.concatenate([resting[:2], lost]))["seen"]
+    assert promises.bounded("axis", "value", resting)["held"]
+    assert "flagged after 2 steps" in promises.bounded("axis", "value", np.concatenate([resting[:2], lost]))["seen"]
     for column, value in ((0, np.nan), (3, 1.1), (7, 200.0)):
         odd = resting.copy()
         odd[2, 0, column] = value
-        assert not stress.bounded("axis", "value", odd)["held"]
-    assert not stress.flagged("axis", "value", lost, True)["held"]
-    assert stress.flagged("axis", "value", lost, False)["held"]
-    assert stress.refusal(partial(int, "3"), "")[1] is False
-    assert stress.refusal(partial(int, "x"), "weight")[1] is False
+        assert not promises.bounded("axis", "value", odd)["held"]
+    assert not promises.flagged("axis", "value", lost, True)["held"]
+    assert promises.flagged("axis", "value", lost, False)["held"]
+    assert promises.refusal(partial(int, "3"), "")[1] is False
+    assert promises.refusal(partial(int, "x"), "weight")[1] is False
 
 
 def test_closest_points_keep_their_promises_where_capsules_are_degenerate() -> None:
@@ -165,7 +165,7 @@ def test_closest_points_keep_their_promises_where_capsules_are_degenerate() -> N
 
 
 def test_every_case_has_a_place_in_the_picture() -> None:
-    rows = [stress.row(axis, 1, "promise", "seen", held) for axis in ("a", "b", "c") for held in (True, False)]
+    rows = [promises.row(axis, 1, "promise", "seen", held) for axis in ("a", "b", "c") for held in (True, False)]
     drawn = stability.picture(rows, "title")
     assert sum(np.shape(each.get_offsets())[0] for axes in drawn.axes for each in axes.collections) == len(rows)
 

@@ -13,8 +13,8 @@ from larp_model.detection import first_contacts
 from larp_model.simulator import Simulator
 from mpc import CEM, Dynamics, Gradient, evaluate
 from mpc.search import coloured_noise
+from tasks.benchmarks.promises import Bench, in_double, row
 from tasks.benchmarks.report import Row
-from tasks.benchmarks.stress import Bench, in_double, row
 from tasks.episodes.around_kick import random_episodes
 from tasks.exploration import exploration_std
 from tasks.kick import Kick

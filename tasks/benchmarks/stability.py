@@ -22,9 +22,9 @@ from larp_model.errors import InputError
 from larp_model.simulator import Simulator
 from mpc import CEM, MPPI, CostTerm, GaussNewton, Gradient, Planner
 from mpc.loop import Phase, Window, execute
-from tasks.benchmarks import gradients, report, stress
+from tasks.benchmarks import gradients, random_scenes, report, stress, wild_states
+from tasks.benchmarks.promises import Bench, refusal, row
 from tasks.benchmarks.report import Row
-from tasks.benchmarks.stress import Bench, refusal, row
 from tasks.command import prepare_jax, run
 from tasks.kick import Kick
 from tasks.models import models_of
@@ -269,7 +269,7 @@ def main(
         weights: manifest of weights that correct larp's physics; none by default.
         publish: put the table into RESULTS.md.
     """
-    kinds = len(stress.KINDS)
+    kinds = len(random_scenes.KINDS)
     if scenes < kinds:
         raise InputError(f"scenes is {scenes}, but must be at least {kinds}, one of each kind")
     if states < 32:
@@ -281,19 +281,19 @@ def main(
     bench = Bench(kick, continued_model.dynamics)  # type: ignore[attr-defined]
 
     def scene_rows(kind: str) -> list[Row]:
-        model = bench.model if kind == "human and ball" else Simulator.of_physics(stress.drawn(kind, None))
-        share = len(range(stress.KINDS.index(kind), scenes, kinds))
-        return stress.scene_rows(kind, model, share, 20, seed)
+        model = bench.model if kind == "human and ball" else Simulator.of_physics(random_scenes.drawn(kind, None))
+        share = len(range(random_scenes.KINDS.index(kind), scenes, kinds))
+        return random_scenes.scene_rows(kind, model, share, 20, seed)
 
     jobs: dict[str, Callable[[], list[Row]]] = {
-        f"{body} {field}": partial(stress.sizes, bench, body, field)
+        f"{body} {field}": partial(wild_states.sizes, bench, body, field)
         for body, field in (
             ("human", "length"), ("human", "radius"), ("human", "mass"), ("ball", "radius"), ("ball", "mass")
         )
     }  # fmt: skip
     jobs |= {
-        "wild states": partial(stress.wild_states, bench),
-        "far and lost": partial(stress.far_and_lost, bench),
+        "wild states": partial(wild_states.wild_states, bench),
+        "far and lost": partial(wild_states.far_and_lost, bench),
         "offsets": partial(stress.offsets, bench),
         "precision": partial(stress.precision, bench),
         "batches": partial(stress.batches, bench),
@@ -306,7 +306,7 @@ def main(
         "slopes of a ball": partial(gradients.ball_slopes, bench),
         "gradients of kicks": partial(gradients.of_kicks, bench, continued_model, 64, seed),
     }
-    jobs |= {f"random scenes: {kind}": partial(scene_rows, kind) for kind in stress.KINDS}
+    jobs |= {f"random scenes: {kind}": partial(scene_rows, kind) for kind in random_scenes.KINDS}
     command = f"python -m tasks.benchmarks.stability --scenes {scenes} --seed {seed} --states {states}"
     rows = [each for found in report.collect(json, command, caught(jobs)) for each in found["rows"]]
     held = sum(each["held"] for each in rows)
