@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -115,7 +115,8 @@ def keeps_energy(scene: Scene) -> Law:
         moving = (states[..., -1, packed.VELOCITY] ** 2).sum(-1) + 0.4 * radius**2 * (
             states[..., -1, packed.ANGULAR_VELOCITY] ** 2
         ).sum(-1)
-        return 0.5 * mass * moving + mass * scene.gravity * states[..., -1, 2]
+        total: np.ndarray = 0.5 * mass * moving + mass * scene.gravity * states[..., -1, 2]
+        return total
 
     def law(start: np.ndarray, states: np.ndarray) -> tuple[str, str, bool]:
         gained = float((energy(states) / energy(start)).max(initial=1.0) - 1.0)
@@ -124,84 +125,129 @@ def keeps_energy(scene: Scene) -> Law:
     return law
 
 
+Change = Callable[[np.ndarray], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Start of a kick, (L, 13), with joint targets (48, J, 3) [rad], from which cases differ by one change."""
+
+    kick: Kick
+    state: np.ndarray
+    controls: np.ndarray
+
+    def case(
+        self,
+        axis: str,
+        value: str,
+        change: Change = lambda state: None,
+        targets: np.ndarray | None = None,
+        torque: float = 0.0,
+        law: Law | None = None,
+    ) -> Case:
+        """Return the case of this start after a change in place, by default none; see `Case`."""
+        state = self.state.copy()
+        change(state)
+        return Case(axis, value, state, self.controls if targets is None else targets, torque, law)
+
+
 def cases(kick: Kick, controls: np.ndarray) -> list[Case]:
     """Return starts that do not occur in kicks, each with the quantity that is varied."""
-    scene, base = kick.scene, kick.start()
-    base[-1, :2] = 3.0, 0.0
-    found: list[Case] = []
-    lower, upper = scene.limits
-    random = np.random.default_rng(0)
-    toss = random.standard_normal((len(base) - 1, 3))
-    toss /= np.linalg.norm(toss, axis=-1, keepdims=True)
+    state = kick.start()
+    state[-1, :2] = 3.0, 0.0
+    start = Start(kick, state, controls)
+    parts = (_speeds, _angular_speeds, _torques, _joint_targets, _overlaps, _heights, _wrong_states)
+    return [case for part in parts for case in part(start)]
 
-    def add(axis: str, value: str, change: Callable[[np.ndarray], None], **rest: Any) -> None:
-        state = base.copy()
-        change(state)
-        found.append(Case(axis, value, state, rest.pop("targets", controls), **rest))
 
-    def put(rows: Any, columns: Any, value: Any) -> Callable[[np.ndarray], None]:
-        return lambda state: state.__setitem__((rows, columns), value)
+def _put(rows: Any, columns: Any, value: Any) -> Change:
+    return lambda state: state.__setitem__((rows, columns), value)
 
-    law, links = keeps_energy(scene), slice(0, -1)
+
+def _speeds(start: Start) -> Iterator[Case]:
+    law = keeps_energy(start.kick.scene)
     for speed in (5.0, 10.0, 20.0, 50.0):
+        value, slanting = f"{speed:g} m/s", (0.6 * speed, 0.0, 0.8 * speed)
+        yield start.case("ball speed at the ground", value, partial(_fall, speed), law=law)
+        yield start.case("ball speed at the foot", value, partial(_shoot_at, start.kick.foot, speed))
+        yield start.case("speed of every link", value, _put(slice(0, -1), packed.VELOCITY, slanting))
 
-        def fall(state: np.ndarray, speed: float = speed) -> None:
-            state[-1, 2], state[-1, packed.VELOCITY] = 1.0, (0.3 * speed, 0.0, -speed)
 
-        add("ball speed at the ground", f"{speed:g} m/s", fall, law=law)
+def _fall(speed: float, state: np.ndarray) -> None:
+    state[-1, 2], state[-1, packed.VELOCITY] = 1.0, (0.3 * speed, 0.0, -speed)
 
-        def shot(state: np.ndarray, speed: float = speed) -> None:
-            place = state[kick.foot, packed.POSITION]
-            state[-1, packed.POSITION] = place + np.array([0.5, 0.0, 0.05])
-            state[-1, packed.VELOCITY] = -speed, 0.0, 0.0
 
-        add("ball speed at the foot", f"{speed:g} m/s", shot)
-        add("speed of every link", f"{speed:g} m/s", put(links, packed.VELOCITY, (0.6 * speed, 0.0, 0.8 * speed)))
-    for angular_speed in (10.0, 50.0, 100.0, 200.0):
-        add(
-            "ball spin on the ground",
-            f"{angular_speed:g} rad/s",
-            put(-1, packed.ANGULAR_VELOCITY, (0.0, angular_speed, 0.0)),
-            law=law,
-        )
-        add("spin of every link", f"{angular_speed:g} rad/s", put(links, packed.ANGULAR_VELOCITY, angular_speed * toss))
-    nothing = lambda state: None  # noqa: E731
+def _shoot_at(foot: int, speed: float, state: np.ndarray) -> None:
+    state[-1, packed.POSITION] = state[foot, packed.POSITION] + np.array([0.5, 0.0, 0.05])
+    state[-1, packed.VELOCITY] = -speed, 0.0, 0.0
+
+
+def _angular_speeds(start: Start) -> Iterator[Case]:
+    law = keeps_energy(start.kick.scene)
+    axes = np.random.default_rng(0).standard_normal((len(start.state) - 1, 3))
+    axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
+    for speed in (10.0, 50.0, 100.0, 200.0):
+        value = f"{speed:g} rad/s"
+        rolling = _put(-1, packed.ANGULAR_VELOCITY, (0.0, speed, 0.0))
+        yield start.case("ball spin on the ground", value, rolling, law=law)
+        yield start.case("spin of every link", value, _put(slice(0, -1), packed.ANGULAR_VELOCITY, speed * axes))
+
+
+def _torques(start: Start) -> Iterator[Case]:
     for torque in (10.0, 100.0, 1e3, 1e4):
-        add("torque on every link", f"{torque:g} N m", nothing, torque=torque)
-    for name, bound in (("lower", lower), ("upper", upper)):
+        yield start.case("torque on every link", f"{torque:g} N m", torque=torque)
+
+
+def _joint_targets(start: Start) -> Iterator[Case]:
+    shape = start.controls.shape
+    for name, bound in zip(("lower", "upper"), start.kick.scene.limits, strict=True):
         for factor in (1.0, 2.0, 5.0):
-            targets = np.broadcast_to(factor * bound, controls.shape)
-            add("joint targets", f"{factor:g} x {name} limit", nothing, targets=targets)
+            targets = np.broadcast_to(factor * bound, shape)
+            yield start.case("joint targets", f"{factor:g} x {name} limit", targets=targets)
     for angle in (np.pi, 2.0 * np.pi, 100.0):
-        add("joint targets", f"{angle:.3g} rad about every axis", nothing, targets=np.full(controls.shape, angle))
+        yield start.case("joint targets", f"{angle:.3g} rad about every axis", targets=np.full(shape, angle))
+
+
+def _overlaps(start: Start) -> Iterator[Case]:
+    kick, foot = start.kick, start.kick.foot
     for depth in (0.01, 0.05, 0.1):
-        add("ball inside the foot", f"{100 * depth:g} cm", _into_foot(kick, depth))
-    add("ball inside the foot", "centres coincide", lambda s: s[-1].__setitem__(packed.POSITION, s[kick.foot, :3]))
-    add("ball inside the pelvis", "centres coincide", lambda s: s[-1].__setitem__(packed.POSITION, s[0, :3]))
+        yield start.case("ball inside the foot", f"{100 * depth:g} cm", _into_foot(kick, depth))
+    for name, link in (("foot", foot), ("pelvis", 0)):
+        yield start.case(f"ball inside the {name}", "centres coincide", partial(_ball_to, link))
     for depth in (0.05, 0.11, 0.5):
-        add("ball inside the ground", f"{100 * depth:g} cm", put(-1, 2, scene.links[-1].radius - depth))
+        lowered = _put(-1, 2, kick.scene.links[-1].radius - depth)
+        yield start.case("ball inside the ground", f"{100 * depth:g} cm", lowered)
     for depth in (0.05, 0.2, 1.0):
-        add("human inside the ground", f"{100 * depth:g} cm", partial(_lift, -depth))
-    for height in (1.0, 10.0, 100.0):
-        add("human above the ground", f"{height:g} m", partial(_lift, height))
-    add("all links in one place", "1 m up", put(slice(None), packed.POSITION, (0.0, 0.0, 1.0)))
-    add("human on its head", "pelvis turned by pi", _upside_down)
-    for scale in (-1.0, 0.5, 2.0):
-
-        def stretch(state: np.ndarray, scale: float = scale) -> None:
-            state[:, packed.ORIENTATION] *= scale
-
-        add("length of quaternions", f"x {scale:g}", stretch)
-    return found
+        yield start.case("human inside the ground", f"{100 * depth:g} cm", partial(_lift, -depth))
 
 
-def _into_foot(kick: Kick, depth: float) -> Callable[[np.ndarray], None]:
+def _into_foot(kick: Kick, depth: float) -> Change:
     reach = kick.scene.links[kick.foot].radius + kick.scene.links[-1].radius - depth
-    return lambda s: s[-1].__setitem__(packed.POSITION, s[kick.foot, :3] + (0.0, -reach, 0.0))
+    return lambda state: state[-1].__setitem__(packed.POSITION, state[kick.foot, :3] + (0.0, -reach, 0.0))
+
+
+def _ball_to(link: int, state: np.ndarray) -> None:
+    state[-1, packed.POSITION] = state[link, packed.POSITION]
+
+
+def _heights(start: Start) -> Iterator[Case]:
+    for height in (1.0, 10.0, 100.0):
+        yield start.case("human above the ground", f"{height:g} m", partial(_lift, height))
 
 
 def _lift(height: float, state: np.ndarray) -> None:
     state[:-1, 2] += height
+
+
+def _wrong_states(start: Start) -> Iterator[Case]:
+    yield start.case("all links in one place", "1 m up", _put(slice(None), packed.POSITION, (0.0, 0.0, 1.0)))
+    yield start.case("human on its head", "pelvis turned by pi", _upside_down)
+    for scale in (-1.0, 0.5, 2.0):
+        yield start.case("length of quaternions", f"x {scale:g}", partial(_stretch, scale))
+
+
+def _stretch(scale: float, state: np.ndarray) -> None:
+    state[:, packed.ORIENTATION] *= scale
 
 
 def _upside_down(state: np.ndarray) -> None:
