@@ -5,7 +5,7 @@ Each case is a row: the quantity that is varied, its value, the promise, the obs
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,8 +20,8 @@ from rich.table import Table
 from larp_model.engines.mujoco import Truth
 from larp_model.errors import InputError
 from larp_model.simulator import Simulator
-from mpc import CEM, MPPI, CostTerm, GaussNewton, Gradient, Planner
-from mpc.loop import Phase, Window, execute
+from mpc import CEM, MPPI, CostTerm, Dynamics, GaussNewton, Gradient, Planner, Window
+from mpc.loop import Phase, execute
 from tasks.benchmarks import gradients, random_scenes, report, stress, wild_states
 from tasks.benchmarks.promises import Bench, refusal, row
 from tasks.benchmarks.report import Row
@@ -71,79 +71,118 @@ def planned(planner: Planner, state: Any = None, reference: Any = None) -> tuple
     return planner.step(planner.init(jax.random.key(0)), state, Window(0.0, reference))
 
 
+# Optimisers of the one-link planners, by name.
+SEARCHES: dict[str, Any] = {
+    "CEM": SMALL,
+    "Gradient": Gradient(elites=2),
+    "both": (SMALL, Gradient(elites=2)),
+    "MPPI": MPPI(samples=8, elites=2),
+    "Gauss-Newton, differences": GaussNewton(directions=6),
+    "Gauss-Newton, forward": GaussNewton(directions=6, jacobian="forward"),
+}
+# Promises of a plan.
+WARM_START = "the warm start, cost inf, 0 candidates finite"
+NO_WORSE = "a finite plan that costs no more than none"
+
+# Whether a plan and its info are as promised.
+Expectation = Callable[[Any, Any], bool]
+
+
+def is_warm_start(plan: Any, info: Any) -> bool:
+    """Return whether no candidate was finite and the plan stayed at zero."""
+    return bool(info.cost == np.inf and info.finite == 0 and not np.asarray(plan.knots).any())
+
+
+def is_no_worse(plan: Any, info: Any) -> bool:
+    """Return whether the plan costs no more than that of zero targets."""
+    return bool(info.cost <= 0.0450001 and info.finite > 0)
+
+
+def is_reference(plan: Any, info: Any) -> bool:
+    """Return whether the plan is the reference itself."""
+    return bool(not np.asarray(plan.knots).any() and info.finite > 0)
+
+
+def plan_row(value: str, promise: str, planner: Planner, expectation: Expectation, **arguments: Any) -> Row:
+    """Return the row of a first plan, which must be finite and as expected. arguments: of `planned`."""
+    plan, info = planned(planner, **arguments)
+    if not (np.isfinite(plan.knots).all() and np.isfinite(plan.spread).all()):
+        return row("planner", value, promise, "the plan is not finite", False)
+    observation = f"cost {info.cost:.3g}, {info.finite} of {info.candidates} finite"
+    return row("planner", value, promise, observation, expectation(plan, info))
+
+
 def small_planners() -> list[Row]:
     """Return rows of one-link planners with few candidates, lost candidates, extreme slopes or refused arguments."""
-    rows = []
+    return [*_lost_candidates(), *_fewest_candidates(), *_slopes(), *_references(), *_refused_arguments()]
 
-    def check(
-        value: str, promise: str, planner: Planner, expected: Callable[[Any, Any], bool], **arguments: Any
-    ) -> None:
-        plan, info = planned(planner, **arguments)
-        observation = f"cost {info.cost:.3g}, {info.finite} of {info.candidates} finite"
-        is_finite = bool(np.isfinite(plan.knots).all() and np.isfinite(plan.spread).all())
-        passed = is_finite and expected(plan, info)
-        rows.append(row("planner", value, promise, observation if is_finite else "the plan is not finite", passed))
 
-    nothing = "the warm start, cost inf, 0 candidates finite"
-    lost = lambda plan, info: info.cost == np.inf and info.finite == 0 and not np.asarray(plan.knots).any()  # noqa: E731
-    good = lambda plan, info: info.cost <= 0.0450001 and info.finite > 0  # noqa: E731
-    better = "a finite plan that costs no more than none"
-    searches: tuple[tuple[str, Any], ...] = (
-        ("CEM", SMALL),
-        ("Gradient", Gradient(elites=2)),
-        ("both", (SMALL, Gradient(elites=2))),
-        ("MPPI", MPPI(samples=8, elites=2)),
-        ("Gauss-Newton, differences", GaussNewton(directions=6)),
-        ("Gauss-Newton, forward", GaussNewton(directions=6, jacobian="forward")),
-    )
-    for name, optimizers in searches:
-        check(f"all candidates lost, {name}", nothing, toy(Shaky(-1.0), optimizers), lost)
-        check(f"most candidates lost, {name}", better, toy(Shaky(0.05), optimizers), good)
-    check("one candidate", better, toy(Shaky(np.inf), Gradient(steps=8, elites=1)), good)
-    check("the fewest of CEM: 4", better, toy(Shaky(np.inf), CEM(samples=4, rounds=4, elites=2)), good)
-    check("horizon 2, the shortest", better, toy(Shaky(np.inf), horizon=2), good)
-    check("horizon 2000", better, toy(Shaky(np.inf), horizon=2000), good)
+def _lost_candidates() -> Iterator[Row]:
+    for name, optimizers in SEARCHES.items():
+        yield plan_row(f"all candidates lost, {name}", WARM_START, toy(Shaky(-1.0), optimizers), is_warm_start)
+        yield plan_row(f"most candidates lost, {name}", NO_WORSE, toy(Shaky(0.05), optimizers), is_no_worse)
+
+
+def _fewest_candidates() -> Iterator[Row]:
+    still = Shaky(np.inf)
+    for value, planner in (
+        ("one candidate", toy(still, Gradient(steps=8, elites=1))),
+        ("the fewest of CEM: 4", toy(still, CEM(samples=4, rounds=4, elites=2))),
+        ("horizon 2, the shortest", toy(still, horizon=2)),
+        ("horizon 2000", toy(still, horizon=2000)),
+    ):
+        yield plan_row(value, NO_WORSE, planner, is_no_worse)
+
+
+def _slopes() -> Iterator[Row]:
+    def is_consistent(plan: Any, info: Any) -> bool:
+        return bool(np.isfinite(info.cost) == (info.finite > 0))
+
+    forward = "Gauss-Newton, forward"
     for steepness in (1e8, 1e15, 1e25):
-        for name, optimizers in (("Gradient", Gradient(steps=2, elites=1)), searches[-1]):
-            steep = toy(Shaky(np.inf, steepness), optimizers)
+        for name, optimizers in (("Gradient", Gradient(steps=2, elites=1)), (forward, SEARCHES[forward])):
+            planner = toy(Shaky(np.inf, steepness), optimizers)
             promise = "finite knots; cost finite, or inf and 0 finite"
-            consistent = lambda plan, info: np.isfinite(info.cost) == (info.finite > 0)  # noqa: E731
-            check(f"a slope of {steepness:g} m/rad, {name}", promise, steep, consistent)
-    no_reference = np.full((6, 1, 3), np.nan)
-    check("reference of NaN", nothing, toy(Shaky(np.inf)), lost, reference=no_reference)
-    check(
-        "reference at infinity",
-        better,
-        toy(Shaky(np.inf)),
-        lambda p, i: i.finite > 0,
-        reference=np.full((6, 1, 3), np.inf),
-    )
-    locked = lambda plan, info: not np.asarray(plan.knots).any() and info.finite > 0  # noqa: E731
-    for name, optimizers in searches:
-        check(f"spread 0, {name}", "the reference itself", toy(Shaky(np.inf), optimizers, spread=0.0), locked)
+            yield plan_row(f"a slope of {steepness:g} m/rad, {name}", promise, planner, is_consistent)
 
-    coarse = toy(Shaky(np.inf))
-    target = jnp.full((6, 1, 3), 0.1234567, jnp.bfloat16)
-    dtype = coarse.controls(coarse.init(jax.random.key(0)), target).dtype
-    rows.append(row("planner", "reference of bfloat16", "joint targets of 32 bits", str(dtype), dtype == jnp.float32))
-    for value, words, call in (
-        ("horizon 1", "knots", lambda: toy(Shaky(0.0), horizon=1)),
-        ("one knot", "knots", lambda: toy(Shaky(0.0), knots=1)),
+
+def _references() -> Iterator[Row]:
+    still = Shaky(np.inf)
+    planner, shape = toy(still), (6, 1, 3)
+    yield plan_row("reference of NaN", WARM_START, planner, is_warm_start, reference=np.full(shape, np.nan))
+    infinite = np.full(shape, np.inf)
+    yield plan_row(
+        "reference at infinity", NO_WORSE, planner, lambda plan, info: bool(info.finite > 0), reference=infinite
+    )
+    for name, optimizers in SEARCHES.items():
+        locked = toy(still, optimizers, spread=0.0)
+        yield plan_row(f"spread 0, {name}", "the reference itself", locked, is_reference)
+    coarse = jnp.full(shape, 0.1234567, jnp.bfloat16)
+    dtype = planner.controls(planner.init(jax.random.key(0)), coarse).dtype
+    yield row("planner", "reference of bfloat16", "joint targets of 32 bits", str(dtype), dtype == jnp.float32)
+
+
+def _refused_arguments() -> Iterator[Row]:
+    still = Shaky(0.0)
+    planner = toy(Shaky(np.inf))
+    calls: tuple[tuple[str, str, Callable[[], Any]], ...] = (
+        ("horizon 1", "knots", lambda: toy(still, horizon=1)),
+        ("one knot", "knots", lambda: toy(still, knots=1)),
         ("one candidate of CEM", "elites", lambda: CEM(samples=1, elites=1)),
         ("no candidate of Gradient", "elites", lambda: Gradient(elites=0)),
-        ("spread not finite", "spread", lambda: toy(Shaky(0.0), spread=np.nan)),
-        ("state of NaN", "state", lambda: planned(coarse, state=np.full((1, 13), np.nan))),
-        ("state of 1e39", "state", lambda: planned(coarse, state=np.full((1, 13), 1e39))),
-        ("reference of another horizon", "reference", lambda: planned(coarse, reference=np.zeros((5, 1, 3)))),
+        ("spread not finite", "spread", lambda: toy(still, spread=np.nan)),
+        ("state of NaN", "state", lambda: planned(planner, state=np.full((1, 13), np.nan))),
+        ("state of 1e39", "state", lambda: planned(planner, state=np.full((1, 13), 1e39))),
+        ("reference of another horizon", "reference", lambda: planned(planner, reference=np.zeros((5, 1, 3)))),
         ("target at infinity", "target", lambda: check_target((np.inf, 0.0, 0.0))),
         ("target of NaN", "target", lambda: check_target((0.0, np.nan, 0.0))),
-    ):
+    )
+    for value, words, call in calls:
         with np.errstate(over="ignore"):
-            rows.append(row("planner", value, "refused by name", *refusal(call, words)))
-    return rows
+            yield row("planner", value, "refused by name", *refusal(call, words))
 
 
-def targets(bench: Bench, continued_model: Any) -> list[Row]:
+def targets(bench: Bench, continued_model: Dynamics) -> list[Row]:
     """Return rows of kick plans to targets, most of which no ball can reach."""
     kick = bench.kick
     planner = kick.planner(continued_model, (CEM(samples=16, rounds=2, elites=4),))
@@ -182,7 +221,7 @@ def execution(bench: Bench) -> list[Row]:
     rows = []
     still = toy(Shaky(np.inf))
 
-    class Lost:
+    class DivergingWorld:
         """World of one link whose state becomes NaN in its third step."""
 
         count = 0
@@ -198,7 +237,7 @@ def execution(bench: Bench) -> list[Row]:
     def carried_out(interval: int, reference: float) -> None:
         controls = np.full((6, 1, 3), reference)
         phase = Phase(still, still, interval, lambda step: Window(0.01 * step, controls))
-        execute(Lost(), np.zeros((1, 13)), (phase,), 5, jax.random.key(0))
+        execute(DivergingWorld(), np.zeros((1, 13)), (phase,), 5, jax.random.key(0))
 
     for value, interval in (("lost between two plans", 10), ("lost just before a plan", 3)):
         observation, passed = refusal(partial(carried_out, interval, 0.0), "diverged in step 2")
@@ -227,6 +266,54 @@ def caught(jobs: dict[str, Callable[[], list[Row]]]) -> dict[str, Callable[[], R
 
 
 # The report.
+
+
+def jobs_of(bench: Bench, continued_model: Dynamics, states: int, seed: int) -> dict[str, Callable[[], list[Row]]]:
+    """Return the jobs of all cases but random scenes, by name.
+
+    continued_model: the model of the scene that goes on with the ball alone. states: on which gradients are compared.
+    """
+    jobs: dict[str, Callable[[], list[Row]]] = {
+        f"{body} {field}": partial(wild_states.sizes, bench, body, field)
+        for body, field in (
+            ("human", "length"), ("human", "radius"), ("human", "mass"), ("ball", "radius"), ("ball", "mass")
+        )
+    }  # fmt: skip
+    return jobs | {
+        "wild states": partial(wild_states.wild_states, bench),
+        "far and lost": partial(wild_states.far_and_lost, bench),
+        "offsets": partial(stress.offsets, bench),
+        "precision": partial(stress.precision, bench),
+        "batches": partial(stress.batches, bench),
+        "horizons": partial(stress.horizons, bench),
+        "capsules": stress.geometry,
+        "planners": small_planners,
+        "targets": partial(targets, bench, continued_model),
+        "execution": partial(execution, bench),
+        "gradients of steps": partial(gradients.of_steps, bench, states, seed),
+        "slopes of a ball": partial(gradients.ball_slopes, bench),
+        "gradients of kicks": partial(gradients.of_kicks, bench, continued_model, 64, seed),
+    }
+
+
+def scene_jobs(bench: Bench, scenes: int, seed: int) -> dict[str, Callable[[], list[Row]]]:
+    """Return the jobs of random scenes by name, one of each kind; `scenes` are shared out evenly among the kinds."""
+
+    def rows_of(kind: str) -> list[Row]:
+        model = bench.model if kind == "human and ball" else Simulator.of_physics(random_scenes.drawn(kind, None))
+        share = len(range(random_scenes.KINDS.index(kind), scenes, len(random_scenes.KINDS)))
+        return random_scenes.scene_rows(kind, model, share, 20, seed)
+
+    return {f"random scenes: {kind}": partial(rows_of, kind) for kind in random_scenes.KINDS}
+
+
+def table_of(rows: list[Row], title: str) -> Table:
+    """Return a table with one line per row."""
+    table = Table("pushed", "to", "promised", "seen", "held", title=title)
+    for case in rows:
+        held = "yes" if case["held"] else "**not held**"
+        table.add_row(case["axis"], case["value"], case["promise"], case["seen"], held)
+    return table
 
 
 def picture(rows: list[Row], title: str) -> Figure:
@@ -279,46 +366,15 @@ def main(
     kick = Kick.standard()
     continued_model = models_of(kick.scene, "larp", weights).whole
     bench = Bench(kick, continued_model.dynamics)  # type: ignore[attr-defined]
-
-    def scene_rows(kind: str) -> list[Row]:
-        model = bench.model if kind == "human and ball" else Simulator.of_physics(random_scenes.drawn(kind, None))
-        share = len(range(random_scenes.KINDS.index(kind), scenes, kinds))
-        return random_scenes.scene_rows(kind, model, share, 20, seed)
-
-    jobs: dict[str, Callable[[], list[Row]]] = {
-        f"{body} {field}": partial(wild_states.sizes, bench, body, field)
-        for body, field in (
-            ("human", "length"), ("human", "radius"), ("human", "mass"), ("ball", "radius"), ("ball", "mass")
-        )
-    }  # fmt: skip
-    jobs |= {
-        "wild states": partial(wild_states.wild_states, bench),
-        "far and lost": partial(wild_states.far_and_lost, bench),
-        "offsets": partial(stress.offsets, bench),
-        "precision": partial(stress.precision, bench),
-        "batches": partial(stress.batches, bench),
-        "horizons": partial(stress.horizons, bench),
-        "capsules": stress.geometry,
-        "planners": small_planners,
-        "targets": partial(targets, bench, continued_model),
-        "execution": partial(execution, bench),
-        "gradients of steps": partial(gradients.of_steps, bench, states, seed),
-        "slopes of a ball": partial(gradients.ball_slopes, bench),
-        "gradients of kicks": partial(gradients.of_kicks, bench, continued_model, 64, seed),
-    }
-    jobs |= {f"random scenes: {kind}": partial(scene_rows, kind) for kind in random_scenes.KINDS}
+    jobs = jobs_of(bench, continued_model, states, seed) | scene_jobs(bench, scenes, seed)
     command = f"python -m tasks.benchmarks.stability --scenes {scenes} --seed {seed} --states {states}"
-    rows = [each for found in report.collect(json, command, caught(jobs)) for each in found["rows"]]
-    held = sum(each["held"] for each in rows)
+    rows = [row for result in report.collect(json, command, caught(jobs)) for row in result["rows"]]
+    held = sum(row["held"] for row in rows)
     content = {"command": command, "hardware": report.hardware(), "cases": len(rows), "held": held, "rows": rows}
     report.write_json(json, content)
     title = f"Stability: {held} of {len(rows)} promises held"
     report.write_picture(json.with_suffix(".png"), picture(rows, title))
-    table = Table("pushed", "to", "promised", "seen", "held", title=title)
-    for each in rows:
-        table.add_row(
-            each["axis"], each["value"], each["promise"], each["seen"], "yes" if each["held"] else "**not held**"
-        )
+    table = table_of(rows, title)
     report.show(table)
     if publish:
         report.publish("stability", title, command, table)
