@@ -56,7 +56,7 @@ class Point:
 
     @property
     def name(self) -> str:
-        """Return a name: model, optimisers of first plan and replans, steps between replans, ground-truth trials."""
+        """Return a name: model, optimisers of first plan and replans, steps between replans, validation."""
         preset = self.preset
         model = "larp" if self.dynamics == "larp" else f"mujoco {self.substeps}"
         validation = ""
@@ -98,61 +98,72 @@ def cem(samples: int, rounds: int, elites: int) -> CEM:
 
 def points() -> tuple[Point, ...]:
     """Return the points to measure: the presets and variations around them, each once."""
-    return tuple(dict.fromkeys((*map(Point, PRESETS.values()), *_around())))
+    variations = (*_sampling(), *_gauss_newton(), *_replans(), *_combinations(), *_validated(), *_mujoco())
+    return tuple(dict.fromkeys((*map(Point, PRESETS.values()), *variations)))
 
 
-def _around() -> Iterator[Point]:
-    newton = GaussNewton
-    once, twice, few = newton(rounds=1), newton(rounds=2), cem(16, 5, 8)
+# Optimisers that several points share.
+ONCE, TWICE, SIX = GaussNewton(rounds=1), GaussNewton(rounds=2), GaussNewton(rounds=6)
+FEW = cem(16, 5, 8)
 
-    def larp(*first: Optimizer, replan: Optimizer = once, interval: int = 5, **verified: Any) -> Point:
-        return Point(Preset(first, (replan,), interval, **verified))
 
-    # Sampling alone.
+def _larp(*first: Optimizer, replan: Optimizer = ONCE, interval: int = 5, **validation: Any) -> Point:
+    return Point(Preset(first, (replan,), interval, **validation))
+
+
+def _sampling() -> Iterator[Point]:
     for samples, rounds, elites in ((32, 4, 8), (32, 16, 8), (64, 8, 12), (64, 16, 12), (64, 32, 12), (128, 8, 16)):
-        yield larp(cem(samples, rounds, elites), replan=cem(max(2 * elites, samples // 2), max(1, rounds // 3), elites))
-    yield larp(MPPI(samples=64, rounds=16), replan=MPPI(samples=32, rounds=5))
-    # Gauss-Newton: rounds, directions, the step of its differences, forward derivatives.
+        replan = cem(max(2 * elites, samples // 2), max(1, rounds // 3), elites)
+        yield _larp(cem(samples, rounds, elites), replan=replan)
+    yield _larp(MPPI(samples=64, rounds=16), replan=MPPI(samples=32, rounds=5))
+
+
+def _gauss_newton() -> Iterator[Point]:
+    """Yield points of other rounds and directions, step of the differences, and forward derivatives."""
     for rounds, directions in (
-        (1, 24),
-        (2, 24),
-        (3, 24),
-        (4, 24),
-        (9, 24),
-        (12, 24),
-        (24, 24),
-        (6, 8),
-        (9, 16),
-        (12, 32),
-    ):
-        yield larp(newton(rounds=rounds, directions=directions), replan=newton(rounds=1, directions=directions))
+        (1, 24), (2, 24), (3, 24), (4, 24), (9, 24), (12, 24), (24, 24), (6, 8), (9, 16), (12, 32)
+    ):  # fmt: skip
+        replan = GaussNewton(rounds=1, directions=directions)
+        yield _larp(GaussNewton(rounds=rounds, directions=directions), replan=replan)
     for step in (0.005, 0.1, 0.3):
-        yield larp(newton(rounds=12, step=step), replan=newton(rounds=1, step=step))
+        yield _larp(GaussNewton(rounds=12, step=step), replan=GaussNewton(rounds=1, step=step))
     for rounds in (6, 12):
-        forward = newton(rounds=rounds, jacobian="forward")
-        yield larp(forward, replan=newton(rounds=1, jacobian="forward"))
-    # Steps between replans, and optimisers of replans.
+        forward = GaussNewton(rounds=rounds, jacobian="forward")
+        yield _larp(forward, replan=GaussNewton(rounds=1, jacobian="forward"))
+
+
+def _replans() -> Iterator[Point]:
+    """Yield points of other steps between replans, and of other optimisers of replans."""
     for interval in (1, 2, 3, 8, 12):
-        yield larp(newton(rounds=6), interval=interval)
-    for replan in (twice, newton(rounds=4), few):
-        yield larp(newton(rounds=6), replan=replan)
-    # After sampling, and other gradients.
-    yield larp(cem(32, 4, 8), newton(rounds=4))
-    yield larp(cem(32, 8, 8), newton(rounds=6))
-    yield larp(Gradient(steps=16, elites=8), replan=Gradient(steps=2, elites=8))
-    # Trials in the ground truth.
+        yield _larp(SIX, interval=interval)
+    for replan in (TWICE, GaussNewton(rounds=4), FEW):
+        yield _larp(SIX, replan=replan)
+
+
+def _combinations() -> Iterator[Point]:
+    """Yield points of Gauss-Newton after sampling, and of reverse gradients."""
+    yield _larp(cem(32, 4, 8), GaussNewton(rounds=4))
+    yield _larp(cem(32, 8, 8), SIX)
+    yield _larp(Gradient(steps=16, elites=8), replan=Gradient(steps=2, elites=8))
+
+
+def _validated() -> Iterator[Point]:
+    """Yield points whose plans are validated in the ground truth."""
     for verify, tolerance in (((2, 1), 0.004), ((4, 1), 0.004), ((8, 1), 0.004), ((8, 3), 0.01), ((8, 3), 0.002)):
-        yield larp(newton(rounds=6), verify=verify, tolerance=tolerance)
-    yield larp(newton(rounds=6), verify=(8, 3), candidates=2)
-    yield larp(newton(rounds=6), verify=(8, 3), interval=12)
-    rest = cem(32, 2, 12)
-    yield larp(cem(64, 8, 12), replan=rest, verify=(2, 2), correct=cem(128, 2, 16), candidates=8, tolerance=0.0)
-    # MuJoCo as the model.
+        yield _larp(SIX, verify=verify, tolerance=tolerance)
+    yield _larp(SIX, verify=(8, 3), candidates=2)
+    yield _larp(SIX, verify=(8, 3), interval=12)
+    replan = cem(32, 2, 12)
+    yield _larp(cem(64, 8, 12), replan=replan, verify=(2, 2), correct=cem(128, 2, 16), candidates=8, tolerance=0.0)
+
+
+def _mujoco() -> Iterator[Point]:
+    """Yield points whose model is MuJoCo."""
     for substeps in (5, 10, 20):
-        for first in (twice, newton(rounds=6)):
-            yield Point(Preset((first,), (once,), interval=5), "mujoco", substeps)
+        for first in (TWICE, SIX):
+            yield Point(Preset((first,), (ONCE,), interval=5), "mujoco", substeps)
     for substeps in (5, 10):
-        yield Point(Preset((cem(64, 8, 12),), (few,), interval=5), "mujoco", substeps)
+        yield Point(Preset((cem(64, 8, 12),), (FEW,), interval=5), "mujoco", substeps)
 
 
 def measure(kick: Kick, point: Point, weights: Path | None, targets: int, seed: int) -> report.Row:
