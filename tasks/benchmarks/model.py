@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,6 +30,53 @@ from tasks.scenarios import Scenario, around, scenario, trained_at
 # Batch sizes at which a step is timed, and steps of each timed rollout.
 BATCHES, TIMED = (1, 64, 512), 40
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
+
+
+@dataclass(frozen=True)
+class ModelSettings:
+    """Settings of a run that its figures depend on; see the arguments of `main`."""
+
+    scene: str
+    sequences: int
+    seed: int
+    weights: Path | None
+    states: Path | None
+    reference: Path | None
+    bodies: Literal["usual", "varied"]
+    beside: DesignName | None
+    bullet: bool
+    substeps: int
+
+    @property
+    def labels(self) -> list[str]:
+        """Return what distinguishes the run, in a few words each."""
+        files = [path.stem for path in (self.weights, self.reference) if path]
+        return [self.scene, *files, *(["bodies varied"] if self.bodies == "varied" else [])]
+
+    @property
+    def name(self) -> str:
+        """Return the name of the run's JSON and of its part of RESULTS.md."""
+        return "_".join(["model", *self.labels]).replace(" ", "_")
+
+    @property
+    def other_weights(self) -> Path:
+        """Return the manifest of the weights that are compared with, of the design `beside`."""
+        return trained_at(self.scene, self.beside) / "weights" / f"{self.scene}.json"
+
+    @property
+    def command(self) -> str:
+        """Return the command that repeats the run."""
+        drawn = f"--sequences {self.sequences} --seed {self.seed}"
+        options = [
+            f"--weights {self.weights}" if self.weights else "",
+            f"--states {self.states.name}" if self.states else drawn,
+            f"--substeps {self.substeps}" if self.substeps != FINE_SUBSTEPS and self.states is None else "",
+            f"--reference {self.reference.name}" if self.reference else "",
+            "--bodies varied" if self.bodies == "varied" else "",
+            f"--beside {self.beside}" if self.beside else "",
+            "--bullet" if self.bullet else "",
+        ]
+        return " ".join([f"python -m tasks.benchmarks.model --scene {self.scene}", *filter(None, options)])
 
 
 def picture(windows: dict[str, dict[str, float]], chosen: Scenario, title: str) -> Figure:
@@ -63,75 +111,70 @@ def main(
     substeps: int = FINE_SUBSTEPS,
     publish: bool = False,
 ) -> None:
-    """Compare rollouts of the simulator with truth episodes from unseen initial states.
+    """Compare rollouts of the simulator with ground-truth episodes from unseen initial states.
 
-    The truth is MuJoCo at the engine steps at which plans are executed: at those that networks are trained on, its own
-    launches are off by as much as the simulator's.
+    The ground truth is MuJoCo at the engine steps at which plans are executed: at those that networks are trained on,
+    its own launches are off by as much as the simulator's.
 
     Args:
         scene: what is simulated.
-        sequences: truth episodes.
+        sequences: ground-truth episodes.
         seed: of the episodes.
         json: where the figures go; the picture goes beside them.
         weights: manifest of weights that correct physics; none by default.
-        states: truth episodes (.npz) to evaluate on instead.
+        states: ground-truth episodes (.npz) to evaluate on instead.
         reference: a captured kick (BVH) to draw the episodes around.
         bodies: varied draws another human for every episode.
         beside: weights of this design, from where `tasks.train --design` leaves them, on the same episodes.
-        bullet: also how far Bullet, the second truth, strays from the first.
-        substeps: of the truth, engine steps in a step of the scene.
+        bullet: also how far Bullet is from the ground truth.
+        substeps: of the ground truth, engine steps in a step of the scene.
         publish: put the table into RESULTS.md.
     """
     chosen = around(scenario(scene), reference, bodies == "varied")
+    settings = ModelSettings(scene, sequences, seed, weights, states, reference, bodies, beside, bullet, substeps)
     for argument, value in (("sequences", sequences), ("substeps", substeps)):
         if value < 1:
             raise InputError(f"{argument} is {value}, but must be at least 1")
-    labels = [
-        scene,
-        *(path.stem for path in (weights, reference) if path),
-        *(["bodies varied"] if bodies == "varied" else []),
-    ]
-    name = "_".join(["model", *labels]).replace(" ", "_")
-    json = json or Path(f"runs/benchmarks/{name}.json")
+    json = json or Path(f"runs/benchmarks/{settings.name}.json")
     report.ready(json, publish, weights)
     prepare_jax()
-    other = trained_at(scene, beside) / "weights" / f"{scene}.json"
-    if beside and not other.is_file():
+    if beside and not settings.other_weights.is_file():
         raise InputError(
-            f"beside is {beside}, but {other} is not there: `python -m tasks.train --scene {scene} --design {beside}`"
+            f"beside is {beside}, but {settings.other_weights} is not there: "
+            f"`python -m tasks.train --scene {scene} --design {beside}`"
         )
-    if states is None:
-        drawn, _ = chosen.draw(sequences, seed)
-        truth = Truth(chosen.scene, min(len(drawn.states), 64), substeps)
-        starts, *inputs = drawn
-        episodes, _ = truth_episodes.record(truth, starts[:, 0], *inputs)
-    else:
-        episodes = truth_episodes.load(states, chosen.scene)
-    results = errors_of(weights, chosen, episodes)
-    source = f"--states {states.name}" if states else f"--sequences {sequences} --seed {seed}"
-    if weights:
-        source = f"--weights {weights} {source}"
-    if substeps != FINE_SUBSTEPS and states is None:
-        source += f" --substeps {substeps}"
-    if reference:
-        source += f" --reference {reference.name}"
-    if bodies == "varied":
-        source += " --bodies varied"
-    if beside:
-        source += f" --beside {beside}"
-        results["beside"] = {"design": beside, **errors_of(other, chosen, episodes)}
-    if bullet:
-        source += " --bullet"
-        results["bullet"] = bullet_errors(chosen.scene, episodes, chosen.windows)
-    command = f"python -m tasks.benchmarks.model --scene {scene} {source}"
-    report.write_json(json, {"command": command, "hardware": report.hardware(), **results})
-    title = f"{', '.join(labels)}: {len(episodes.states)} sequences"
+    episodes = episodes_of(settings, chosen)
+    results = results_of(settings, chosen, episodes)
+    report.write_json(json, {"command": settings.command, "hardware": report.hardware(), **results})
+    title = f"{', '.join(settings.labels)}: {len(episodes.states)} sequences"
     report.write_picture(json.with_suffix(".png"), picture(results["windows"], chosen, title))
     tables = [table_of(results, chosen), *launch_tables(results["launch"])]
     for table in tables:
         report.show(table)
     if publish:
-        report.publish(name, f"Model: {', '.join(labels)}", command, *tables)
+        report.publish(settings.name, f"Model: {', '.join(settings.labels)}", settings.command, *tables)
+
+
+def episodes_of(settings: ModelSettings, chosen: Scenario) -> Episodes:
+    """Return the ground-truth episodes to evaluate on: those of a file, or new ones of the scenario."""
+    if settings.states is not None:
+        return truth_episodes.load(settings.states, chosen.scene)
+    drawn, _ = chosen.draw(settings.sequences, settings.seed)
+    truth = Truth(chosen.scene, min(len(drawn.states), 64), settings.substeps)
+    starts, *inputs = drawn
+    episodes, _ = truth_episodes.record(truth, starts[:, 0], *inputs)
+    return episodes
+
+
+def results_of(settings: ModelSettings, chosen: Scenario, episodes: Episodes) -> dict[str, Any]:
+    """Return the errors of the weights and, where they are compared with, of another design's and of Bullet."""
+    results = errors_of(settings.weights, chosen, episodes)
+    if settings.beside:
+        other = errors_of(settings.other_weights, chosen, episodes)
+        results["beside"] = {"design": settings.beside, **other}
+    if settings.bullet:
+        results["bullet"] = bullet_errors(chosen.scene, episodes, chosen.windows)
+    return results
 
 
 def errors_of(manifest: Path | None, chosen: Scenario, episodes: Episodes) -> dict[str, Any]:
