@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -26,6 +28,82 @@ from tasks.targets import random_kick, random_roll
 from tasks.task import HEIGHT
 
 WITHIN = (0.1, 0.25, 0.5)
+
+
+@dataclass(frozen=True)
+class KickSettings:
+    """Settings of a run that its figures depend on; see the arguments of `main`."""
+
+    targets: int
+    seed: int
+    preset: PresetName
+    dynamics: DynamicsName
+    weights: Path | None
+    reference: Path | None
+    height: float
+    bodies: Literal["usual", "varied"]
+    body: Detail
+    self_contact: bool
+    rolling: float
+    noise: bool
+    budget: float | None
+    substeps: int
+
+    def check(self) -> None:
+        """Raise InputError if a setting is invalid, or two of them contradict each other."""
+        if self.targets < 1:
+            raise InputError(f"targets is {self.targets}, but must be at least 1")
+        preset_of(self.preset)
+        if self.bodies == "varied" and (self.height != HEIGHT or self.budget is not None):
+            raise InputError("bodies is 'varied', but height and budget are those of one body")
+        if not (np.isfinite(self.rolling) and self.rolling >= 0.0):
+            raise InputError(f"rolling is {self.rolling}, but must be a finite speed of at least 0 m/s")
+
+    @property
+    def variant(self) -> dict[str, str]:
+        """Return the options that differ from the usual, with their values as text."""
+        options = {
+            "reference": self.reference.stem if self.reference else "",
+            "height": f"{self.height:g}" if self.height != HEIGHT else "",
+            "bodies": self.bodies if self.bodies != "usual" else "",
+            "body": self.body if self.body != "lean" else "",
+            "self_contact": "on" if self.self_contact else "",
+            "rolling": f"{self.rolling:g}" if self.rolling else "",
+            "noise": "on" if self.noise else "",
+            "budget": f"{self.budget:g}" if self.budget is not None else "",
+            "substeps": f"{self.substeps}" if self.substeps != FINE_SUBSTEPS else "",
+        }
+        return {option: value for option, value in options.items() if value}
+
+    @property
+    def name(self) -> str:
+        """Return the name of the run's JSON and of its part of RESULTS.md."""
+        variant = (f"{option}_{value}" for option, value in self.variant.items())
+        return "_".join(["kick", self.preset, self.dynamics, *variant])
+
+    @property
+    def title(self) -> str:
+        """Return the title of the picture and of the table."""
+        variant = (f"{option} {value}" for option, value in self.variant.items())
+        return ", ".join([f"Kick: {self.preset}", self.dynamics, *variant])
+
+    @property
+    def command(self) -> str:
+        """Return the command that repeats the run."""
+        flags = {
+            "reference": f"--reference {self.reference.name if self.reference else ''}",
+            "self_contact": "--self-contact",
+            "noise": "--noise",
+        }
+        variant = (flags.get(option, f"--{option} {value}") for option, value in self.variant.items())
+        planned = f"--targets {self.targets} --seed {self.seed} --preset {self.preset} --dynamics {self.dynamics}"
+        return " ".join([f"python -m tasks.benchmarks.kick {planned}", *variant])
+
+    def task(self) -> Kick:
+        """Return the kick of a human of the usual sizes, or of this height."""
+        return Kick.standard(
+            self.reference, self.height, body=self.body, self_contact=self.self_contact, substeps=self.substeps
+        )
 
 
 def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -116,104 +194,112 @@ def main(
         rolling: greatest speed [m/s] of a ball that comes from ahead or from the kicking side; 0: it rests.
         noise: show the planner the state with sensing noise.
         budget: seconds for the first plan, and a fifth of them for each replan; the preset is scaled to fit.
-        substeps: engine steps of the truth in each of the 10 ms, where plans are tried and executed.
+        substeps: engine steps of the ground truth in a step of 10 ms, where plans are validated and executed.
         publish: put the table into RESULTS.md.
     """
-    if targets < 1:
-        raise InputError(f"targets is {targets}, but must be at least 1")
-    chosen = preset_of(preset)
-    if bodies == "varied" and (height != HEIGHT or budget is not None):
-        raise InputError("bodies is 'varied', but height and budget are those of one body")
-    if not (np.isfinite(rolling) and rolling >= 0.0):
-        raise InputError(f"rolling is {rolling}, but must be a finite speed of at least 0 m/s")
-    variant = {
-        "reference": reference.stem if reference else "",
-        "height": f"{height:g}" if height != HEIGHT else "",
-        "bodies": bodies if bodies != "usual" else "",
-        "body": body if body != "lean" else "",
-        "self_contact": "on" if self_contact else "",
-        "rolling": f"{rolling:g}" if rolling else "",
-        "noise": "on" if noise else "",
-        "budget": f"{budget:g}" if budget is not None else "",
-        "substeps": f"{substeps}" if substeps != FINE_SUBSTEPS else "",
-    }
-    options = {option: value for option, value in variant.items() if value}
-    name = "_".join(["kick", preset, dynamics, *(f"{option}_{value}" for option, value in options.items())])
-    json = json or Path(f"runs/benchmarks/{name}.json")
+    settings = KickSettings(
+        targets, seed, preset, dynamics, weights, reference, height, bodies, body, self_contact, rolling, noise, budget,
+        substeps,
+    )  # fmt: skip
+    settings.check()
+    json = json or Path(f"runs/benchmarks/{settings.name}.json")
     report.ready(json, publish, weights)
     prepare_jax()
+    rows = report.collect(json, settings.command, jobs_of(settings))
+    figures = summarise(rows)
+    content = {"command": settings.command, "hardware": report.hardware(), **figures, "rows": rows}
+    report.write_json(json, content)
+    report.write_picture(json.with_suffix(".png"), picture(rows, settings.title))
+    table = table_of(figures, settings)
+    report.show(table)
+    if publish:
+        report.publish(settings.name, f"{settings.title}, {targets} targets", settings.command, table)
 
-    def planned(kick: Kick) -> tuple[Session, Planners]:
-        session = Session(kick, dynamics, weights)
-        fitting = chosen if budget is None else session.within(chosen, budget, USUAL)
-        return session, session.planners(fitting)
 
-    usual = Kick.standard(reference, height, body=body, self_contact=self_contact, substeps=substeps)
-    people = random_people(np.random.default_rng((seed, 1)), usual.scene, targets)
-    always = planned(usual) if bodies == "usual" else None
-    random = np.random.default_rng(seed)
+def jobs_of(settings: KickSettings) -> dict[str, Callable[[], report.Row]]:
+    """Return the jobs that plan and execute one kick each, by name; the targets are drawn at once."""
+    usual = settings.task()
+    people = random_people(np.random.default_rng((settings.seed, 1)), usual.scene, settings.targets)
+    shared = Planned.of(usual, settings) if settings.bodies == "usual" else None
+    random = np.random.default_rng(settings.seed)
 
     def one(index: int, target: np.ndarray, shift: np.ndarray, roll: np.ndarray) -> report.Row:
-        session, planners = always or planned(Kick.of(usual.scene.sized(people[index]), reference, substeps=substeps))
-        kick = session.task
-        sense = noisy(kick.scene, np.random.default_rng((seed, index))) if noise else lambda state: state
-        execution = session.execute(planners, target, seed + index, kick.start(shift, roll), sense=sense)
-        return summarize(kick, execution, target) | {
-            "halved_error_m": replayed(kick, execution, target, 2 * substeps),
-            "preset": preset,
-            "dynamics": dynamics,
-            "weights": session.models.weights,
-            "seed": seed + index,
-            "ball_shift": shift.tolist(),
-            "ball_velocity": roll.tolist(),
-        }
+        if shared is not None:
+            return kick_row(shared, settings, index, target, shift, roll)
+        scene = usual.scene.sized(people[index])
+        own = Planned.of(Kick.of(scene, settings.reference, substeps=settings.substeps), settings)
+        return kick_row(own, settings, index, target, shift, roll)
 
-    jobs = {}
-    for index in range(targets):
+    jobs: dict[str, Callable[[], report.Row]] = {}
+    for index in range(settings.targets):
         target, shift = random_kick(random)
-        roll = random_roll(random, rolling) if rolling else np.zeros(2)
+        roll = random_roll(random, settings.rolling) if settings.rolling else np.zeros(2)
         jobs[f"kick {index}"] = partial(one, index, target, shift, roll)
-    command = (
-        f"python -m tasks.benchmarks.kick --targets {targets} --seed {seed} --preset {preset} --dynamics {dynamics}"
-    )
-    flags = {
-        "reference": f"--reference {reference.name if reference else ''}",
-        "self_contact": "--self-contact",
-        "noise": "--noise",
+    return jobs
+
+
+class Planned(NamedTuple):
+    """Session of a kick with its planners."""
+
+    session: Session
+    planners: Planners
+
+    @classmethod
+    def of(cls, kick: Kick, settings: KickSettings) -> Planned:
+        """Return a session with the planners of the preset, scaled to the budget if there is one."""
+        session, preset = Session(kick, settings.dynamics, settings.weights), preset_of(settings.preset)
+        fitting = preset if settings.budget is None else session.within(preset, settings.budget, USUAL)
+        return cls(session, session.planners(fitting))
+
+
+def kick_row(
+    planned: Planned, settings: KickSettings, index: int, target: np.ndarray, shift: np.ndarray, roll: np.ndarray
+) -> report.Row:
+    """Return the row of a kick: its summary, and the miss at twice the engine steps.
+
+    target: (3,) [m]. shift: of the ball (2,) [m]. roll: its velocity (2,) [m/s].
+    """
+    session, kick, seed = planned.session, planned.session.task, settings.seed + index
+    sense = noisy(kick.scene, np.random.default_rng((settings.seed, index))) if settings.noise else lambda state: state
+    execution = session.execute(planned.planners, target, seed, kick.start(shift, roll), sense=sense)
+    return summarize(kick, execution, target) | {
+        "halved_error_m": replayed(kick, execution, target, 2 * settings.substeps),
+        "preset": settings.preset,
+        "dynamics": settings.dynamics,
+        "weights": session.models.weights,
+        "seed": seed,
+        "ball_shift": shift.tolist(),
+        "ball_velocity": roll.tolist(),
     }
-    command = " ".join([command, *(flags.get(option, f"--{option} {value}") for option, value in options.items())])
-    rows = report.collect(json, command, jobs)
-    figures = summarise(rows)
-    title = ", ".join([f"Kick: {preset}", dynamics, *(f"{option} {value}" for option, value in options.items())])
-    report.write_json(json, {"command": command, "hardware": report.hardware(), **figures, "rows": rows})
-    report.write_picture(json.with_suffix(".png"), picture(rows, title))
+
+
+def table_of(figures: dict[str, Any], settings: KickSettings) -> Table:
+    """Return a table with one line per figure of `summarise`."""
 
     def three(figure: str) -> str:
         return ", ".join(f"{figures[f'{which}_{figure}']:.3f} m" for which in ("mean", "median", "p95"))
 
-    table = Table("measure", "value", title=title)
+    table = Table("measure", "value", title=settings.title)
     for measure, value in (
         ("mean truth error", f"{figures['mean_truth_error_m']:.3f} m"),
         ("median, 90th percentile", f"{figures['median_truth_error_m']:.3f} m, {figures['p90_truth_error_m']:.3f} m"),
         *(
             (f"replayed at {steps} engine steps: mean, median, 95th percentile", three(f"{which}_error_m"))
-            for steps, which in ((FINE_SUBSTEPS, "limit"), (2 * substeps, "halved"))
+            for steps, which in ((FINE_SUBSTEPS, "limit"), (2 * settings.substeps, "halved"))
         ),
         *((f"within {reach} m", f"{100 * figures['success'][str(reach)]:.0f} %") for reach in WITHIN),
         ("mean model error", f"{figures['mean_model_error_m']:.3f} m"),
         ("mean gap between truth and model", f"{figures['mean_gap_m']:.3f} m"),
         ("mean distance from the reference", f"{figures['mean_reference_deviation_m']:.3f} m"),
-        ("ball touched", f"{figures['touched']} of {targets}"),
-        ("fell within 2 s", f"{figures['falls']} of {targets}"),
+        ("ball touched", f"{figures['touched']} of {settings.targets}"),
+        ("fell within 2 s", f"{figures['falls']} of {settings.targets}"),
         ("first plan", f"{figures['mean_plan_seconds']:.2f} s"),
         ("replan, p50 and p99", f"{figures['replan_ms']['p50']:.0f} ms, {figures['replan_ms']['p99']:.0f} ms"),
         ("compilation, where the cache did not have it", f"{figures['compile_seconds']:.0f} s"),
         ("truth rollouts asked for by the planner", str(figures["truth_rollouts"])),
     ):
         table.add_row(measure, value)
-    report.show(table)
-    if publish:
-        report.publish(name, f"{title}, {targets} targets", command, table)
+    return table
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -51,7 +51,7 @@ MEASURES = {
 }
 # The paper's own figures of AIST's videos, in the order of `TOLD`: DiffPhy's (E. Gartner et al. 2022), and what their
 # trajectory optimisation reaches in Bullet and in LARP.
-PAPER = {
+PAPER: dict[str, tuple[float | None, ...]] = {
     "easy: DiffPhy": (150.0, 106.0, 66.0, 12.0, None, 19.6),
     "easy: Bullet": (154.0, 113.0, 69.0, 13.0, 0.41, 4.0),
     "easy: LARP": (150.0, 113.0, 70.0, 13.0, 0.37, 5.0),
@@ -66,6 +66,61 @@ EASY = (
     "gLH_sBM_c09_d17_mLH1_ch02", "gLH_sFM_c03_d18_mLH0_ch15", "gLO_sBM_c05_d14_mLO4_ch07", "gLO_sBM_c07_d15_mLO4_ch09",
     "gLO_sFM_c02_d15_mLO4_ch21", "gMH_sBM_c01_d24_mMH3_ch02", "gMH_sBM_c05_d24_mMH4_ch07",
 )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class FilmSettings:
+    """Settings of films and of how they are reconstructed; see the arguments of `main`."""
+
+    clips: tuple[Path, ...]
+    aist: Path | None
+    sequences: tuple[str, ...]
+    cameras: int
+    seconds: float
+    ways: tuple[Way, ...]
+    preset: PresetName
+    seed: int
+
+    def check(self) -> None:
+        """Raise InputError if a setting is invalid, or two of them contradict each other."""
+        self._check_cameras()
+        if not 0.4 <= self.seconds <= 60.0:
+            raise InputError(f"seconds is {self.seconds:g}, but must be from 0.4 to 60")
+        self._check_ways()
+        self._check_sources()
+
+    def _check_cameras(self) -> None:
+        if self.cameras < 1:
+            raise InputError(f"cameras is {self.cameras}, but must be at least 1")
+        if self.aist is not None and self.cameras > dances.CAMERAS:
+            raise InputError(f"cameras is {self.cameras}, but AIST++ has {dances.CAMERAS}")
+
+    def _check_ways(self) -> None:
+        ways = self.ways
+        if not ways or len(set(ways)) != len(ways):
+            raise InputError(f"ways are {', '.join(ways) or 'none'}, but must be some of {', '.join(WAYS)}, each once")
+        if "mujoco_timed" in ways and not {"larp", "mujoco"} <= set(ways[: ways.index("mujoco_timed")]):
+            raise InputError("ways has mujoco_timed, but needs larp and mujoco before it, whose times it goes by")
+
+    def _check_sources(self) -> None:
+        if self.clips and self.aist is not None:
+            raise InputError("clips and aist are both set, but films are made of one of them")
+        if self.sequences and self.aist is None:
+            raise InputError(f"sequences has {self.sequences[0]!r}, but aist, the folder they are in, is not set")
+        for clip in self.clips:
+            require_file("clips", clip)
+
+    @property
+    def command(self) -> str:
+        """Return the command that repeats the run."""
+        source = f" --clips {' '.join(clip.name for clip in self.clips)}" if self.clips else ""
+        if self.aist is not None:
+            source = f" --aist {self.aist.name}"
+            source += f" --sequences {' '.join(self.sequences)}" if self.sequences else ""
+        options = "" if self.ways == WAYS else f" --ways {' '.join(self.ways)}"
+        options += "" if self.preset == "balanced" else f" --preset {self.preset}"
+        films = f"{source} --cameras {self.cameras} --seconds {self.seconds:g}"
+        return f"python -m tasks.benchmarks.pose{films}{options} --seed {self.seed}"
 
 
 class Film(NamedTuple):
@@ -238,61 +293,57 @@ def main(
         json: where the figures go; the picture goes beside them.
         publish: put the table into RESULTS.md.
     """
-    if cameras < 1:
-        raise InputError(f"cameras is {cameras}, but must be at least 1")
-    if aist is not None and cameras > dances.CAMERAS:
-        raise InputError(f"cameras is {cameras}, but AIST++ has {dances.CAMERAS}")
-    if not 0.4 <= seconds <= 60.0:
-        raise InputError(f"seconds is {seconds:g}, but must be from 0.4 to 60")
-    if not ways or len(set(ways)) != len(ways):
-        raise InputError(f"ways are {', '.join(ways) or 'none'}, but must be some of {', '.join(WAYS)}, each once")
-    if "mujoco_timed" in ways and not {"larp", "mujoco"} <= set(ways[: ways.index("mujoco_timed")]):
-        raise InputError("ways has mujoco_timed, but needs larp and mujoco before it, whose times it goes by")
-    if clips and aist is not None:
-        raise InputError("clips and aist are both set, but films are made of one of them")
-    if sequences and aist is None:
-        raise InputError(f"sequences has {sequences[0]!r}, but aist, the folder they are in, is not set")
-    for clip in clips:
-        require_file("clips", clip)
-    films: dict[str, Callable[[], Film]] = {
-        f"{'embedded' if clip is None else clip.stem}, camera {camera}": partial(of_clip, clip, camera, seconds, seed)
-        for clip in (clips or (None,))
-        for camera in range(cameras)
-    }
-    if aist is not None:
-        films = dances_of(aist, sequences, cameras, seconds)
+    settings = FilmSettings(clips, aist, sequences, cameras, seconds, ways, preset, seed)
+    settings.check()
+    films = films_of(settings)
     report.ready(json, publish)
     prepare_jax()
-    named = f" --clips {' '.join(clip.name for clip in clips)}" if clips else ""
-    if aist is not None:
-        named = f" --aist {aist.name}" + (f" --sequences {' '.join(sequences)}" if sequences else "")
-    chosen = "" if ways == WAYS else f" --ways {' '.join(ways)}"
-    chosen += "" if preset == "balanced" else f" --preset {preset}"
-    command = f"python -m tasks.benchmarks.pose{named} --cameras {cameras} --seconds {seconds:g}{chosen} --seed {seed}"
     jobs = {name: partial(measured, film, ways, physical.PRESETS[preset], seed) for name, film in films.items()}
-    rows = report.collect(json, command, jobs)
+    rows = report.collect(json, settings.command, jobs)
     averages = {way: means(rows, way) for way in ways}
-    content = {"command": command, "hardware": report.hardware(), "means": averages, "rows": rows}
+    content = {"command": settings.command, "hardware": report.hardware(), "means": averages, "rows": rows}
     report.write_json(json, content)
     report.write_picture(json.with_suffix(".png"), picture(rows, ways))
-    beside = (
-        {} if aist is None else {source: dict(zip(MEASURES, values, strict=False)) for source, values in PAPER.items()}
-    )
     title = f"Motion from keypoints, {preset}, {len(rows)} film{'' if len(rows) == 1 else 's'}"
-    if beside:
+    if aist is not None:
         title += " of AIST++, beside the paper's figures, of videos that it does not name"
-    table = Table("measure", *ways, *beside, title=title)
-    for name, (measure, unit) in MEASURES.items():
-        values = [f"{averages[way][name]:.3g} {unit}" if name in averages[way] else "" for way in ways]
-        published = [figures.get(name) for figures in beside.values()]
-        if any(values):
-            table.add_row(measure, *values, *("" if values is None else f"{values:g}" for values in published))
-    if skates := [row["true_foot_skate"] for row in rows if "true_foot_skate" in row]:
-        table.add_row("foot skate of what was filmed", f"{np.mean(skates):.3g} %")
+    table = table_of(rows, averages, title, {} if aist is None else PAPER)
     report.show(table)
     if publish:
         section = ["pose", *(["aist"] if aist else []), *([] if preset == "balanced" else [preset])]
-        report.publish("-".join(section), title, command, table)
+        report.publish("-".join(section), title, settings.command, table)
+
+
+def films_of(settings: FilmSettings) -> dict[str, Callable[[], Film]]:
+    """Return loaders of films, by name: of AIST++, or of clips seen by synthetic cameras."""
+    if settings.aist is not None:
+        return dances_of(settings.aist, settings.sequences, settings.cameras, settings.seconds)
+    return {
+        f"{'embedded' if clip is None else clip.stem}, camera {camera}": partial(
+            of_clip, clip, camera, settings.seconds, settings.seed
+        )
+        for clip in (settings.clips or (None,))
+        for camera in range(settings.cameras)
+    }
+
+
+def table_of(
+    rows: list[dict[str, Any]],
+    averages: dict[Way, dict[str, float]],
+    title: str,
+    published: dict[str, tuple[float | None, ...]],
+) -> Table:
+    """Return a table with one line per figure: the ways' averages, and beside them those published, by source."""
+    table = Table("measure", *averages, *published, title=title)
+    others = [dict(zip(MEASURES, values, strict=False)) for values in published.values()]
+    for name, (measure, unit) in MEASURES.items():
+        cells = [f"{average[name]:.3g} {unit}" if name in average else "" for average in averages.values()]
+        if any(cells):
+            beside = ("" if (value := other.get(name)) is None else f"{value:g}" for other in others)
+            table.add_row(measure, *cells, *beside)
+    if skates := [row["true_foot_skate"] for row in rows if "true_foot_skate" in row]:
+        table.add_row("foot skate of what was filmed", f"{np.mean(skates):.3g} %")
+    return table
 
 
 if __name__ == "__main__":
