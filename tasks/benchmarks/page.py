@@ -11,7 +11,9 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
+from multiprocessing.context import SpawnProcess
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
 from typing import Any
@@ -57,6 +59,23 @@ LOOKS = msgspec.msgpack.encode(
         up_direction=(0.0, 0.0, 1.0),
     ).as_serializable_dict()
 )
+
+
+@dataclass(frozen=True)
+class PageSettings:
+    """Settings of a run that its figures depend on; see the arguments of `main`."""
+
+    kicks: int
+    alone: int
+    clients: int
+    preset: PresetName
+    seed: int
+
+    @property
+    def command(self) -> str:
+        """Return the command that repeats the run."""
+        counts = f"--kicks {self.kicks} --alone {self.alone} --clients {self.clients}"
+        return f"python -m tasks.benchmarks.page {counts} --preset {self.preset} --seed {self.seed}"
 
 
 def watch(address: str, clients: int, visits: Synchronized[int]) -> None:
@@ -156,53 +175,86 @@ def main(
         raise InputError(f"kicks, alone and clients are {kicks}, {alone} and {clients}, but must be at least 1")
     report.ready(json, publish)
     prepare_jax()
-    random = np.random.default_rng(seed)
-    targets = [random_kick(random)[0] for _ in range(kicks)]
-    kick = Kick.standard()
+    settings = PageSettings(kicks, alone, clients, preset, seed)
+    rows, usage = measure(settings, json)
+    figures = summary(rows) | usage
+    command = settings.command
+    report.write_json(json, {"command": command, "hardware": report.hardware(), **figures, "rows": rows})
+    report.write_picture(json.with_suffix(".png"), picture(rows))
+    table = table_of(figures, f"The page: {kicks} kicks of {preset}, {clients} clients")
+    report.show(table)
+    if publish:
+        report.publish("page", "The page", command, table)
+
+
+def measure(settings: PageSettings, json: Path) -> tuple[dict[str, report.Row], dict[str, Any]]:
+    """Return the rows of all kicks and drags by name, and the resources that the page took and left behind.
+
+    json: where the figures go; an interrupted run resumes from the rows beside it.
+    """
+    random = np.random.default_rng(settings.seed)
+    targets = [random_kick(random)[0] for _ in range(settings.kicks)]
+    kick, preset = Kick.standard(), settings.preset
     choices = Choices({"embedded": lambda: kick}, {preset: PRESETS[preset]}, ("larp",), weights_for(None))
     process, begin = psutil.Process(), time.monotonic()
     session = Session(kick)
     session.run(USUAL, preset)  # what plans and steps keeps its threads
-    before = process.num_threads()
+    threads_before = process.num_threads()
     with tempfile.TemporaryDirectory() as folder, LivePage(port=0, offer=choices.offer(kick)) as page:
-        live = Live(page, choices, USUAL, Path(folder), seed)
+        live = Live(page, choices, USUAL, Path(folder), settings.seed)
         thread = threading.Thread(target=live.serve)
         thread.start()
         until(lambda: page.mode == "planned", 300.0)
-        address = page.address.replace("http", "ws")
-        spawn = multiprocessing.get_context("spawn")
-        visits = spawn.Value("i", 0)
-        watching = spawn.Process(target=watch, args=(address, clients, visits), daemon=True)
-        watching.start()
-        until(lambda: len(process.net_connections("tcp")) > clients, 60.0)
+        watching, visits = watchers(page, settings.clients, process)
         for _ in range(WARM_UP):
             of_kick(live, partial(page.ask, "kick"))
         memory = process.memory_info().rss
-        # Watched and unwatched kicks alternate, for the machine may become slower.
-        jobs: dict[str, Callable[[], report.Row]] = {}
-        for index, target in enumerate(targets):
-            jobs[f"drag {index}"] = partial(of_drag, live, target)
-            jobs[f"watched {index}"] = partial(of_kick, live, partial(page.ask, "kick"))
-            if index < alone:
-                jobs[f"alone {index}"] = partial(headless, live, session, target, preset, seed)
-        counted = f"--kicks {kicks} --alone {alone} --clients {clients}"
-        command = f"python -m tasks.benchmarks.page {counted} --preset {preset} --seed {seed}"
-        rows = dict(zip(jobs, report.collect(json, command, jobs), strict=True))
-        grown = process.memory_info().rss / memory - 1.0
+        jobs = jobs_of(live, session, targets, settings)
+        rows = dict(zip(jobs, report.collect(json, settings.command, jobs), strict=True))
+        growth = process.memory_info().rss / memory - 1.0
         watching.kill()
         page.close()
         thread.join()
-    figures = summary(rows) | {
-        "memory_growth": grown,
+    return rows, {
+        "memory_growth": growth,
         "sockets_left": len(process.net_connections("tcp")),
         "minutes": (time.monotonic() - begin) / 60.0,
         "visits": visits.value,
-        "threads_before": before,
+        "threads_before": threads_before,
         "threads_after": process.num_threads(),
     }
-    report.write_json(json, {"command": command, "hardware": report.hardware(), **figures, "rows": rows})
-    report.write_picture(json.with_suffix(".png"), picture(rows))
-    table = Table("measure", "value", title=f"The page: {kicks} kicks of {preset}, {clients} clients")
+
+
+def watchers(page: LivePage, clients: int, process: psutil.Process) -> tuple[SpawnProcess, Synchronized[int]]:
+    """Start the process of the clients; return it, and its count of visits, once all of them are connected.
+
+    process: this one, which serves the page.
+    """
+    spawn = multiprocessing.get_context("spawn")
+    visits = spawn.Value("i", 0)
+    address = page.address.replace("http", "ws")
+    watching = spawn.Process(target=watch, args=(address, clients, visits), daemon=True)
+    watching.start()
+    until(lambda: len(process.net_connections("tcp")) > clients, 60.0)
+    return watching, visits
+
+
+def jobs_of(
+    live: Live, session: Session, targets: list[np.ndarray], settings: PageSettings
+) -> dict[str, Callable[[], report.Row]]:
+    """Return the jobs by name; watched and unwatched kicks alternate, for the machine may become slower."""
+    jobs: dict[str, Callable[[], report.Row]] = {}
+    for index, target in enumerate(targets):
+        jobs[f"drag {index}"] = partial(of_drag, live, target)
+        jobs[f"watched {index}"] = partial(of_kick, live, partial(live.page.ask, "kick"))
+        if index < settings.alone:
+            jobs[f"alone {index}"] = partial(headless, live, session, target, settings.preset, settings.seed)
+    return jobs
+
+
+def table_of(figures: dict[str, Any], title: str) -> Table:
+    """Return a table with one line per figure."""
+    table = Table("measure", "value", title=title)
     for name, value in (
         ("replan, watched and alone (median)", "{watched_ms:.0f} and {alone_ms:.0f} ms".format(**figures)),
         ("slower by (median of pairs)", f"{100 * figures['slower']:.1f} %"),
@@ -211,16 +263,14 @@ def main(
             "{drag_s:.2f}, {drag_worst_s:.2f} s".format(**figures),
         ),
         ("drawn while it kicks", f"{figures['frames_per_second']:.0f} times a second"),
-        ("memory grew by", f"{100 * grown:.1f} %"),
+        ("memory grew by", f"{100 * figures['memory_growth']:.1f} %"),
         ("sockets left", str(figures["sockets_left"])),
-        ("threads before and after", f"{before} and {figures['threads_after']}"),
+        ("threads before and after", f"{figures['threads_before']} and {figures['threads_after']}"),
         ("clients that came and left", str(figures["visits"])),
         ("it took", f"{figures['minutes']:.0f} min"),
     ):
         table.add_row(name, value)
-    report.show(table)
-    if publish:
-        report.publish("page", "The page", command, table)
+    return table
 
 
 def headless(live: Live, session: Session, target: np.ndarray, preset: PresetName, seed: int) -> report.Row:
