@@ -9,13 +9,13 @@ from __future__ import annotations
 import json as codec
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -56,6 +56,42 @@ STYLES = {"spring": "--", "positional": ":"}
 COLOURS = {"larp": "#d55e00", "mujoco": "#0072b2", "mjx": "#009e73", "brax": "#cc79a7", "bullet": "#7f7f7f"}
 
 
+@dataclass(frozen=True)
+class SpeedSettings:
+    """Settings of a run that its figures depend on; see the arguments of `main`."""
+
+    scenes: tuple[str, ...]
+    engines: tuple[str, ...]
+    sizes: tuple[int, ...]
+    kicks: int
+    seed: int
+
+    @property
+    def command(self) -> str:
+        """Return the command that repeats the run."""
+        names = f"--scenes {','.join(self.scenes)} --engines {','.join(self.engines)}"
+        counts = f"--batch {','.join(map(str, self.sizes))} --kicks {self.kicks} --seed {self.seed}"
+        return f"python -m tasks.benchmarks.speed {names} {counts}"
+
+
+class SpeedMeasurement(NamedTuple):
+    """Rows of all questions, each engine's errors over all replayed kicks, and the rows of these kicks."""
+
+    times: list[report.Row]
+    replays: list[report.Row]
+    kicks: list[report.Row]
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """Return the entries of the JSON."""
+        return {
+            "rows": [row for row in self.times if not row["gradient"]],
+            "gradient": [row for row in self.times if row["gradient"]],
+            "replays": self.replays,
+            "kicks": self.kicks,
+        }
+
+
 def listed(name: str, text: str, options: tuple[str, ...]) -> list[str]:
     """Return the words between commas; raise InputError for one that is not known."""
     words = [word.strip() for word in text.split(",")]
@@ -77,7 +113,7 @@ def variants(engine: str) -> list[str]:
     return [f"brax {pipeline}" for pipeline in PIPELINES] if engine == "brax" else [engine]
 
 
-def questions(scenes: list[str], engines: list[str], sizes: list[int], seed: int) -> Iterator[Question]:
+def questions(scenes: Sequence[str], engines: Sequence[str], sizes: Sequence[int], seed: int) -> Iterator[Question]:
     """Yield the questions of all rows; of one engine in one case the smaller batch comes first."""
     cases = [scene_case for scene in scenes for scene_case in CASES[scene]]
     for engine in engines:
@@ -127,7 +163,7 @@ class QuestionRunner:
         return dict(codec.loads(done.stdout.splitlines()[-1]))
 
 
-def replayed_by(engines: list[str]) -> list[replays.Engine]:
+def replayed_by(engines: Sequence[str]) -> list[replays.Engine]:
     """Return the engines that replay kicks, with their engine steps.
 
     Brax is left out because it supports no human, MJX because it is MuJoCo again.
@@ -171,7 +207,7 @@ def label(row: report.Row) -> str:
     return titled(row["engine"], row["substeps"])
 
 
-def speed_table(rows: list[report.Row], sizes: list[int]) -> Table:
+def speed_table(rows: list[report.Row], sizes: Sequence[int]) -> Table:
     """Return a table of microseconds per scene and step by batch, with compilation and memory at the middle batch."""
     table = Table("engine", "scene", *(f"{size}" for size in sizes), "compiled in", "memory", "launch error")
     table.title = "Microseconds per scene and step of 10 ms, by batch"
@@ -329,45 +365,18 @@ def main(
         publish: put the tables into RESULTS.md and the pictures into docs/.
     """
     scene_names, engine_names = listed("scenes", scenes, tuple(CASES)), listed("engines", engines, tuple(SUBSTEPS))
-    sizes = batches(batch)
+    settings = SpeedSettings(tuple(scene_names), tuple(engine_names), tuple(batches(batch)), kicks, seed)
     if kicks < 0:
         raise InputError(f"kicks is {kicks}, but must be at least 0")
     report.ready(json, publish)
     prepare_jax()
-    replaying = replayed_by(engine_names) if kicks and "human_ball" in scene_names else []
-    runner = QuestionRunner()
-    all_questions = [
-        *questions(scene_names, engine_names, sizes, seed),
-        *(price(*engine, seed) for engine in replaying),
-    ]
-    jobs = {question.name: partial(runner, question) for question in all_questions}
-    played = kicks_of(replaying, kicks, seed) if replaying else {}
-    command = (
-        f"python -m tasks.benchmarks.speed --scenes {','.join(scene_names)} --engines {','.join(engine_names)} "
-        f"--batch {','.join(map(str, sizes))} --kicks {kicks} --seed {seed}"
-    )
-    rows = dict(zip([*jobs, *played], report.collect(json, command, jobs | played), strict=True))
-    summaries = replays.summarise(rows[name]["replays"] for name in played)
-    launch = {(row["engine"], row["substeps"]): row["launch_error"] for row in summaries}
-    for row in summaries:
-        row["us_per_scene_step"] = rows[price(row["engine"], row["substeps"], seed).name].get("us_per_scene_step")
-    times = [rows[name] | {"launch_error": launch.get((rows[name]["engine"], rows[name]["substeps"]))} for name in jobs]
-    report.write_json(
-        json,
-        {
-            "command": command,
-            "hardware": report.hardware(),
-            "rows": [row for row in times if not row["gradient"]],
-            "gradient": [row for row in times if row["gradient"]],
-            "replays": summaries,
-            "kicks": [rows[name] for name in played],
-        },
-    )
-    tables = {"speed": speed_table(times, sizes)}
-    pictures = {"speed": speed_picture(times)}
-    if summaries:
-        tables["accuracy_per_microsecond"] = accuracy_table(summaries)
-        pictures["accuracy"] = accuracy_picture(summaries)
+    measurement = measure(settings, json)
+    report.write_json(json, {"command": settings.command, "hardware": report.hardware(), **measurement.content})
+    tables = {"speed": speed_table(measurement.times, settings.sizes)}
+    pictures = {"speed": speed_picture(measurement.times)}
+    if measurement.replays:
+        tables["accuracy_per_microsecond"] = accuracy_table(measurement.replays)
+        pictures["accuracy"] = accuracy_picture(measurement.replays)
     for name, figure in pictures.items():
         report.write_picture(json.with_name(f"{name}.png"), figure)
         if publish:
@@ -375,7 +384,32 @@ def main(
     for name, table in tables.items():
         report.show(table)
         if publish:
-            report.publish(name, str(table.title), command, table)
+            report.publish(name, str(table.title), settings.command, table)
+
+
+def measure(settings: SpeedSettings, json: Path) -> SpeedMeasurement:
+    """Return the rows of all questions and replayed kicks.
+
+    json: where the figures go; an interrupted run resumes from the rows beside it.
+    """
+    seed = settings.seed
+    replaying = replayed_by(settings.engines) if settings.kicks and "human_ball" in settings.scenes else []
+    runner = QuestionRunner()
+    all_questions = [
+        *questions(settings.scenes, settings.engines, settings.sizes, seed),
+        *(price(*engine, seed) for engine in replaying),
+    ]
+    jobs = {question.name: partial(runner, question) for question in all_questions}
+    kick_jobs = kicks_of(replaying, settings.kicks, seed) if replaying else {}
+    collected = report.collect(json, settings.command, jobs | kick_jobs)
+    rows = dict(zip([*jobs, *kick_jobs], collected, strict=True))
+    kicks = [rows[name] for name in kick_jobs]
+    summaries = replays.summarise(row["replays"] for row in kicks)
+    launch = {(row["engine"], row["substeps"]): row["launch_error"] for row in summaries}
+    for row in summaries:
+        row["us_per_scene_step"] = rows[price(row["engine"], row["substeps"], seed).name].get("us_per_scene_step")
+    times = [rows[name] | {"launch_error": launch.get((rows[name]["engine"], rows[name]["substeps"]))} for name in jobs]
+    return SpeedMeasurement(times, summaries, kicks)
 
 
 if __name__ == "__main__":
