@@ -12,7 +12,8 @@ import os
 import platform
 import time
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -29,13 +30,14 @@ from larp_model.engines.episodes import Episodes
 from larp_model.engines.mujoco import SUBSTEPS
 from larp_model.errors import InputError
 from larp_model.files import require_writable, write_whole
+from larp_model.learned.model import Model
 from larp_model.names import require_file
 from larp_model.networks import Weights
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from tasks.command import prepare_jax, run
 from tasks.curve import curve_picture
-from tasks.scenarios import scenario, trained_at
+from tasks.scenarios import Scenario, scenario, trained_at
 
 EVALUATION_SEED = 1
 
@@ -114,12 +116,12 @@ def main(
         folder: where the run keeps its stages and checkpoints; runs/train/SCENE by default, SCENE_DESIGN_SIZE where
             they are given. A run goes on only with the settings that it was begun with.
         out: where the weights and their manifest go; a folder of the run's by default.
-        episodes: random truth episodes.
+        episodes: random ground-truth episodes.
         effort: multiplies the updates of every stage.
         seed: of the data and the training; the benchmarks use seeds below 100.
         start: manifest of weights of the same model to go on from.
     """
-    console, chosen = Console(), scenario(scene)
+    chosen = scenario(scene)
     folder = folder or trained_at(chosen.name, None if design == "residual" else design, size)
     require_writable(folder, "folder")
     if start:
@@ -137,58 +139,108 @@ def main(
     }
     claim(folder, settings)
     prepare_jax()
-    random = stored_episodes(folder / "random.npz", chosen.scene, lambda: chosen.draw(episodes, seed), console)
-    learned: Weights | None = None
-    sizes = random.morphology
-    rounds: list[dict[str, Any]] = []
-    if start:
-        loaded_model, learned, content = stored.load(start, chosen.scene)
-        if loaded_model != model:
+    training_run = TrainingRun(chosen, model, stages, folder, effort, seed, Console())
+    training_run.run(episodes, start, out)
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingRun:
+    """Training of a scenario's model, stage after stage, in a folder; see the arguments of `main`."""
+
+    scenario: Scenario
+    model: Model
+    stages: tuple[TrainingStage, ...]
+    folder: Path
+    effort: float
+    seed: int
+    console: Console
+
+    def run(self, episodes: int, start: Path | None, out: Path | None) -> None:
+        """Train on random episodes, from weights to start with if there are some; evaluate and write the weights."""
+        path = self.folder / "random.npz"
+        draw = partial(self.scenario.draw, episodes, self.seed)
+        random = stored_episodes(path, self.scenario.scene, draw, self.console)
+        begin = TrainedWeights(None, [], random.morphology)
+        if start:
+            begin = self.started(start, random.morphology)
+        trained = self.trained(begin, random)
+        assert trained.weights is not None
+        held_out, _ = self.scenario.draw(256, EVALUATION_SEED)
+        simulator = Simulator.of(self.model, trained.weights)
+        scores = evaluation.evaluate(simulator, held_out, self.scenario.windows)
+        written = self.save(out or self.folder / "weights", trained, self.recipe(trained, scores))
+        self.console.print_json(json.dumps(scores))
+        self.console.print(f"weights: {written}")
+
+    def started(self, start: Path, sizes: np.ndarray) -> TrainedWeights:
+        """Return the weights of a manifest to go on from; sizes: (N, L, 3) of the episodes, see `TrainedWeights`."""
+        model, weights, content = stored.load(start, self.scenario.scene)
+        if model != self.model:
             raise InputError(f"from is {str(start)!r}, but holds weights of another model")
-        rounds = content["recipe"]["rounds"]
-        sizes = np.concatenate([sizes, stored.extremes(content, chosen.scene)])
+        sizes = np.concatenate([sizes, stored.extremes(content, self.scenario.scene)])
+        return TrainedWeights(weights, content["recipe"]["rounds"], sizes)
 
-    def save(into: Path, recipe: dict[str, Any]) -> Path:
-        assert learned is not None
-        return stored.save(into, chosen.name, model, learned, recipe, sizes)
+    def trained(self, begin: TrainedWeights, random: Episodes) -> TrainedWeights:
+        """Return the weights after all stages; a stage whose weights are in the folder is loaded."""
+        trained = begin
+        for number, stage in enumerate(self.stages):
+            manifest = self.folder / stage.name / f"{self.scenario.name}.json"
+            if manifest.exists():
+                _, weights, content = stored.load(manifest, self.scenario.scene)
+                trained = trained._replace(weights=weights, rounds=content["recipe"]["rounds"])
+            else:
+                trained = self.stage(number, trained, random)
+        return trained
 
-    for number, stage in enumerate(stages):
-        manifest = folder / stage.name / f"{chosen.name}.json"
-        if manifest.exists():
-            _, learned, content = stored.load(manifest, chosen.scene)
-            rounds = content["recipe"]["rounds"]
-            continue
-        updates = max(1, round(effort * stage.recipe.updates))
-        recipe = replace(stage.recipe, updates=updates, seed=seed + number)
-        learned, log = training.train(model, recipe, [(random, 1.0)], folder / stage.name, learned)
-        curve_picture([folder / past_stage.name for past_stage in stages[: number + 1]], folder / "training.png")
-        rounds = [
-            *rounds,
-            {
-                "stage": stage.name,
-                "recipe": asdict(recipe),
-                "episodes": len(random.states),
-                "steps": random.steps,
-                "seconds": log["seconds"],
-                "dropped": log["dropped"],
-                "stopped_early": log["stopped_early"],
-                "last": log["history"][-1] if log["history"] else None,
-            },
-        ]
-        save(folder / stage.name, {"rounds": rounds})
-        console.print(f"{stage.name}: {log['seconds']:.0f} s, {log['dropped']} batches dropped")
-    assert learned is not None
-    held_out, _ = chosen.draw(256, EVALUATION_SEED)
-    scores = evaluation.evaluate(Simulator.of(model, learned), held_out, chosen.windows)
-    recipe_of = {
-        "rounds": rounds,
-        "truth": {"engine": "mujoco", "substeps": SUBSTEPS, "dt": chosen.scene.dt},
-        "hardware": f"{platform.machine()}, {os.cpu_count()} cores, jax {jax.__version__} on {jax.default_backend()}",
-        "scores": {"seed": EVALUATION_SEED, **scores},
-    }
-    written = save(out or folder / "weights", recipe_of)
-    console.print_json(json.dumps(scores))
-    console.print(f"weights: {written}")
+    def stage(self, number: int, begin: TrainedWeights, random: Episodes) -> TrainedWeights:
+        """Train one stage and return its weights, which are also written to the folder."""
+        stage = self.stages[number]
+        folder = self.folder / stage.name
+        updates = max(1, round(self.effort * stage.recipe.updates))
+        recipe = replace(stage.recipe, updates=updates, seed=self.seed + number)
+        weights, log = training.train(self.model, recipe, [(random, 1.0)], folder, begin.weights)
+        pictured = [self.folder / past.name for past in self.stages[: number + 1]]
+        curve_picture(pictured, self.folder / "training.png")
+        entry = {
+            "stage": stage.name,
+            "recipe": asdict(recipe),
+            "episodes": len(random.states),
+            "steps": random.steps,
+            "seconds": log["seconds"],
+            "dropped": log["dropped"],
+            "stopped_early": log["stopped_early"],
+            "last": log["history"][-1] if log["history"] else None,
+        }
+        trained = begin._replace(weights=weights, rounds=[*begin.rounds, entry])
+        self.save(folder, trained, {"rounds": trained.rounds})
+        self.console.print(f"{stage.name}: {log['seconds']:.0f} s, {log['dropped']} batches dropped")
+        return trained
+
+    def recipe(self, trained: TrainedWeights, scores: dict[str, Any]) -> dict[str, Any]:
+        """Return the manifest's entry of how the weights were made, with their scores on held-out episodes."""
+        hardware = f"{platform.machine()}, {os.cpu_count()} cores, jax {jax.__version__} on {jax.default_backend()}"
+        return {
+            "rounds": trained.rounds,
+            "truth": {"engine": "mujoco", "substeps": SUBSTEPS, "dt": self.scenario.scene.dt},
+            "hardware": hardware,
+            "scores": {"seed": EVALUATION_SEED, **scores},
+        }
+
+    def save(self, folder: Path, trained: TrainedWeights, recipe: dict[str, Any]) -> Path:
+        """Write the weights and their manifest; return its path."""
+        assert trained.weights is not None
+        return stored.save(folder, self.scenario.name, self.model, trained.weights, recipe, trained.sizes)
+
+
+class TrainedWeights(NamedTuple):
+    """Weights, None before the first stage, with the manifest's entries of all rounds of training before.
+
+    sizes: morphologies (N, L, 3) that the training has covered.
+    """
+
+    weights: Weights | None
+    rounds: list[dict[str, Any]]
+    sizes: np.ndarray
 
 
 def cli() -> None:
