@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import tempfile
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -93,7 +93,7 @@ def main(
         minutes: that it may take.
         size: of the network.
         out: folder for the weights and their manifest.
-        seed: of the truth and the training.
+        seed: of the episodes and the training.
     """
     begin = time.perf_counter()
     if not (math.isfinite(minutes) and minutes >= LEAST):
@@ -102,37 +102,20 @@ def main(
         require_file("reference", reference)
     require_writable(out, "out")
     prepare_jax()
-    console, budget_seconds = Console(), 60.0 * minutes
-
-    def tell(message: str) -> None:
-        left = max(0.0, budget_seconds - (time.perf_counter() - begin)) / 60.0
-        console.print(f"{message}; {left:.1f} min left")
-
+    clock = Clock(begin, 60.0 * minutes, Console())
     kick = Kick.standard(reference, height, mass=mass, names=names, body=body)
     scene = kick.scene
     physics, no_weights = ResidualModel(scene), Weights({}, {}, {})
     held_out, _ = random_episodes(scene, kick.reference, HELD_OUT, 1_000_000 + seed)
     before = check(physics, no_weights, held_out)
-    tell(f"{HELD_OUT} episodes to check on; {described(before)}")
-    drawing_began, parts = time.perf_counter(), list[Episodes]()
-    while not parts or (time.perf_counter() - drawing_began < TRUTH * budget_seconds and len(parts) * DRAWN < MOST):
-        parts.append(random_episodes(scene, kick.reference, DRAWN, seed + len(parts))[0])
-    random, of_plans = (
-        truth_episodes.join(parts),
-        tried_episodes(kick, KICKS, ROLLOUTS_PER_PLAN, seed, PLANS * budget_seconds),
-    )
-    tell(f"{len(random.states)} random episodes, {len(of_plans.states)} of plans")
+    clock.tell(f"{HELD_OUT} episodes to check on; {described(before)}")
     model = designs.design(scene, "residual", size)
-    recipe = replace(OVER_PHYSICS, updates=MOST, seed=seed)
-    left = budget_seconds - (time.perf_counter() - begin) - CHECKING
-    with tempfile.TemporaryDirectory() as folder:
-        sources = [(drawn, float(len(drawn.states))) for drawn in (random, of_plans)]
-        learned, _ = training.train(model, recipe, sources, Path(folder), seconds=left)
+    learned = trained(kick, model, seed, clock)
     after = check(model, learned, held_out)
-    tell(f"trained; {described(after)}")
+    clock.tell(f"trained; {described(after)}")
     better = after.better_than(before)
     if not better:
-        console.print("what was learned is no better on the whole: what is written is physics alone")
+        clock.console.print("what was learned is no better on the whole: what is written is physics alone")
     content = {
         "reference": None if reference is None else reference.name,
         "height": height,
@@ -142,7 +125,40 @@ def main(
         "after": after._asdict(),
     }
     written = stored.save(out, "adapted", *((model, learned) if better else (physics, no_weights)), content)
-    console.print(f"weights: {written}; {time.perf_counter() - begin:.0f} s in all")
+    clock.console.print(f"weights: {written}; {time.perf_counter() - begin:.0f} s in all")
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Time budget [s] from a beginning on, on the scale of `time.perf_counter`, and the console that shows it."""
+
+    begin: float
+    budget: float
+    console: Console
+
+    @property
+    def left(self) -> float:
+        """Return the time that is left [s]; negative beyond the budget."""
+        return self.budget - (time.perf_counter() - self.begin)
+
+    def tell(self, message: str) -> None:
+        """Print a message with the time that is left."""
+        self.console.print(f"{message}; {max(0.0, self.left) / 60.0:.1f} min left")
+
+
+def trained(kick: Kick, model: Model, seed: int, clock: Clock) -> Weights:
+    """Return weights trained, as long as there is time, on random episodes around a kick and on plans' candidates."""
+    begin, parts = time.perf_counter(), list[Episodes]()
+    while not parts or (time.perf_counter() - begin < TRUTH * clock.budget and len(parts) * DRAWN < MOST):
+        parts.append(random_episodes(kick.scene, kick.reference, DRAWN, seed + len(parts))[0])
+    random = truth_episodes.join(parts)
+    candidates = tried_episodes(kick, KICKS, ROLLOUTS_PER_PLAN, seed, PLANS * clock.budget)
+    clock.tell(f"{len(random.states)} random episodes, {len(candidates.states)} of plans")
+    recipe = replace(OVER_PHYSICS, updates=MOST, seed=seed)
+    sources = [(episodes, float(len(episodes.states))) for episodes in (random, candidates)]
+    with tempfile.TemporaryDirectory() as folder:
+        weights, _ = training.train(model, recipe, sources, Path(folder), seconds=clock.left - CHECKING)
+    return weights
 
 
 def described(errors: Checked) -> str:
