@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
@@ -22,7 +23,7 @@ from larp_model.names import require_file
 from mpc import nearest_on_path
 from tasks.command import Teller, prepare_jax, run
 from tasks.models import DynamicsName
-from tasks.presets import PRESETS, PresetName, changed, preset_of
+from tasks.presets import PRESETS, Preset, PresetName, changed, preset_of
 from tasks.run import Run
 from tasks.session import Session
 from tasks.task import HEIGHT, Task, check_target
@@ -97,61 +98,130 @@ def main(
         json: print the summary as JSON, and on stderr what else is told.
     """
     goal = check_target(target)
-    if reference is not None:
-        require_file("reference", reference)
-    chosen = changed(preset_of(preset), change)
-    require_writable(out, "out")
-    if video is not None:
-        from viewer import check_film
+    human = HumanOptions(reference, names, height, mass, body, self_contact)
+    plans = PlanOptions(" ".join((preset, *change)), changed(preset_of(preset), change), dynamics, weights, seed)
+    outputs = Outputs(out, video, Teller(quiet, json))
+    outputs.check()
+    address = PageAddress(host, port, allow_host) if view else None
+    prepare_jax()
+    with outputs.tell.part("setting up"):
+        session = Session(human.task(), dynamics, weights)
+        session.planners(plans.preset)
+    if address is None:
+        run_once(session, goal, plans, outputs)
+    else:
+        serve(session, goal, human, plans, outputs, address)
 
-        check_film(video)
-        require_writable(video.parent, "video")
-    if view:
+
+@dataclass(frozen=True)
+class HumanOptions:
+    """Options of the human and its reference; see the arguments of `main`. A reference must be a file."""
+
+    reference: Path | None
+    names: Path | None
+    height: float
+    mass: float | None
+    body: Detail
+    self_contact: bool
+
+    def __post_init__(self) -> None:
+        if self.reference is not None:
+            require_file("reference", self.reference)
+
+    def task(self) -> Kick:
+        """Return the kick of this human near its reference."""
+        return Kick.standard(self.reference, self.height, self.mass, self.body, self.self_contact, self.names)
+
+    def embedded_task(self) -> Kick:
+        """Return the kick of this human near the embedded reference."""
+        return Kick.standard(None, self.height, self.mass, self.body, self.self_contact)
+
+
+@dataclass(frozen=True)
+class PlanOptions:
+    """Options of the planner; see the arguments of `main`. label: the preset's name with its changes."""
+
+    label: str
+    preset: Preset
+    dynamics: DynamicsName
+    weights: Path | None
+    seed: int
+
+
+@dataclass(frozen=True)
+class PageAddress:
+    """Address of the page; see the arguments of `main`. Raises InputError if it cannot be opened."""
+
+    host: str
+    port: int
+    allow_host: tuple[str, ...]
+
+    def __post_init__(self) -> None:
         from viewer import require_address
 
-        require_address(host, port, allow_host)
-    prepare_jax()
-    tell = Teller(quiet, json)
-    with tell.part("setting up"):
-        session = Session(Kick.standard(reference, height, mass, body, self_contact, names), dynamics, weights)
-        session.planners(chosen)
-    label = " ".join((preset, *change))
+        require_address(self.host, self.port, self.allow_host)
 
-    def finished(kick: Run) -> None:
-        with tell.part("writing"):
-            kick.save(out)
-        tell.result(kick.table, kick.summary)
-        if video is not None:
+
+@dataclass(frozen=True)
+class Outputs:
+    """Folder and film to write, and the printer of progress and result; see the arguments of `main`."""
+
+    folder: Path
+    video: Path | None
+    tell: Teller
+
+    def check(self) -> None:
+        """Raise InputError if a file cannot be written."""
+        require_writable(self.folder, "out")
+        if self.video is not None:
+            from viewer import check_film
+
+            check_film(self.video)
+            require_writable(self.video.parent, "video")
+
+    def write(self, kick: Run) -> None:
+        """Write the files of a run, and print its result."""
+        with self.tell.part("writing"):
+            kick.save(self.folder)
+        self.tell.result(kick.table, kick.summary)
+        if self.video is not None:
             from viewer import write_film
 
-            with tell.part(f"filming {video}"):
-                write_film(kick.recording, video)
-        tell(f"{out}/: summary.json, kick.npz, kick.png, kick.html")
+            with self.tell.part(f"filming {self.video}"):
+                write_film(kick.recording, self.video)
+        self.tell(f"{self.folder}/: summary.json, kick.npz, kick.png, kick.html")
 
-    if view:
-        from tasks.live import Choices, Live, weights_for
-        from viewer import LivePage
 
-        tasks: dict[str, Callable[[], Task]] = {
-            "embedded" if reference is None else reference.name: lambda: session.task
-        }
-        if reference is not None:
-            tasks["embedded"] = lambda: Kick.standard(None, height, mass, body, self_contact)
-        models = (dynamics, *(other for other in get_args(DynamicsName) if other != dynamics))
-        choices = Choices(tasks, {label: chosen} | PRESETS, models, weights_for(weights))
-        with LivePage(host, port, choices.offer(session.task), allow_host) as page:
-            tell(f"watch it at {page.address} (Ctrl-C ends)")
-            Live(page, choices, goal, out / "kept", seed, finished).serve("kick")
-        return
+def run_once(session: Session, goal: np.ndarray, plans: PlanOptions, outputs: Outputs) -> None:
+    """Plan and execute one kick, print how long the parts took, and write the run."""
     begin = time.perf_counter()
-    tell("planning and executing; what is new is compiled first")
-    kick = session.run(goal, chosen, seed)
-    kick.summary["preset"] = label
+    outputs.tell("planning and executing; what is new is compiled first")
+    kick = session.run(goal, plans.preset, plans.seed)
+    kick.summary["preset"] = plans.label
     infos = [plan.info for plan in kick.execution.plans]
     compiling, planning = (sum(getattr(info, name) for info in infos) for name in ("compile_seconds", "seconds"))
     executing = time.perf_counter() - begin - compiling - planning
-    tell(f"compiling {compiling:.1f} s, planning {planning:.1f} s, executing {executing:.1f} s")
-    finished(kick)
+    outputs.tell(f"compiling {compiling:.1f} s, planning {planning:.1f} s, executing {executing:.1f} s")
+    outputs.write(kick)
+
+
+def serve(
+    session: Session, goal: np.ndarray, human: HumanOptions, plans: PlanOptions, outputs: Outputs, address: PageAddress
+) -> None:
+    """Show the page, on which the user chooses and kicks, until Ctrl-C; the first kick begins at once."""
+    from tasks.live import Choices, Live, weights_for
+    from viewer import LivePage
+
+    reference = human.reference
+    tasks: dict[str, Callable[[], Task]] = {"embedded" if reference is None else reference.name: lambda: session.task}
+    if reference is not None:
+        tasks["embedded"] = human.embedded_task
+    models = (plans.dynamics, *(other for other in get_args(DynamicsName) if other != plans.dynamics))
+    choices = Choices(tasks, {plans.label: plans.preset} | PRESETS, models, weights_for(plans.weights))
+    with LivePage(address.host, address.port, choices.offer(session.task), address.allow_host) as page:
+        outputs.tell(f"watch it at {page.address} (Ctrl-C ends)")
+        live = Live(page, choices, goal, outputs.folder / "kept", plans.seed, outputs.write)
+        live.serve("kick")
 
 
 def cli() -> None:
