@@ -157,15 +157,15 @@ def test_every_planner_keeps_the_contract(problem: str, optimizers: str) -> None
     planner = _planner(PROBLEMS[problem], OPTIMIZERS[optimizers])
     first = planner.init(jax.random.key(7))
     plan, info = planner.step(first, STATE, WINDOW)
-    again, same = planner.step(first, STATE, WINDOW)
+    same_plan, same_info = planner.step(first, STATE, WINDOW)
 
     assert plan.knots.shape == (KNOTS, 1, 3) and info.states.shape == (HORIZON, 1, 13)
     assert jax.tree.map(jnp.shape, plan) == jax.tree.map(jnp.shape, first)
     assert np.isfinite(plan.elites).all() and np.isfinite(plan.spread).all()
     assert info.candidates == sum(len(costs) for costs in info.costs)
     assert info.finite == sum(np.isfinite(costs).sum() for costs in info.costs)
-    assert info.compile_seconds > 0 and same.compile_seconds == 0 and same.seconds > 0
-    assert (plan.knots == again.knots).all() and info.cost == same.cost
+    assert info.compile_seconds > 0 and same_info.compile_seconds == 0 and same_info.seconds > 0
+    assert (plan.knots == same_plan.knots).all() and info.cost == same_info.cost
 
     controls = np.asarray(planner.controls(plan, REFERENCE))
     assert controls.shape == REFERENCE.shape and np.abs(controls).max() <= 0.5
@@ -203,11 +203,11 @@ class Hollows:
     """A problem of one angle x: r = 0.5 + |x| up to x = 1, x - 2 beyond; at 0 no slope tells of the zero at 2."""
 
     def __init__(self) -> None:
-        self.asked = 0
+        self.evaluated = 0
 
     def evaluate(self, knots: np.ndarray) -> Evaluations:
         x = knots[:, :1, 0, 0]
-        self.asked += len(x)
+        self.evaluated += len(x)
         residual = np.where(x < 1.0, 0.5 + np.abs(x), x - 2.0)
         return Evaluations(np.sum(residual**2, axis=1), {"miss": residual}, {"miss": np.full_like(residual, 2.0)})
 
@@ -230,7 +230,7 @@ def test_a_fallback_leaves_a_hollow_and_takes_one_candidate_where_the_search_has
 
     problem = Hollows()
     assert fallback.improve(freed, np.random.default_rng(0), problem) is freed  # type: ignore[arg-type]
-    assert problem.asked == 1
+    assert problem.evaluated == 1
 
 
 def test_a_fallback_refuses_a_tolerance_of_no_cost_term() -> None:
@@ -326,24 +326,24 @@ def test_engine_is_called_in_its_own_batches_and_loses_its_lost_rows() -> None:
 
 
 @pytest.mark.parametrize("steps", [1, 7, HORIZON])
-def test_an_engine_computes_only_the_steps_that_suffice_and_repeats_the_last(steps: int) -> None:
-    seen = []
+def test_an_engine_computes_only_the_steps_that_are_needed_and_repeats_the_last(steps: int) -> None:
+    computed = []
 
     class Counting(Engine):
         def rollout(self, states: np.ndarray, controls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            seen.append(controls.shape[1])
+            computed.append(controls.shape[1])
             return super().rollout(states, controls)
 
     controls = 0.02 * jax.random.normal(jax.random.key(0), (5, HORIZON, 1, 3))
     state = jnp.broadcast_to(jnp.asarray(STATE), (5, 1, 13))
     states = jax.jit(MujocoDynamics(Counting()).rollout)(state, controls, steps=steps)
-    whole = PointMass().rollout(state, controls)
-    np.testing.assert_allclose(states[:, :steps], whole[:, :steps], atol=1e-6)
+    all_states = PointMass().rollout(state, controls)
+    np.testing.assert_allclose(states[:, :steps], all_states[:, :steps], atol=1e-6)
     np.testing.assert_array_equal(states[:, steps:], jnp.repeat(states[:, steps - 1 : steps], HORIZON - steps, axis=1))
-    assert seen == [steps]
+    assert computed == [steps]
 
 
-def test_the_prediction_goes_on_from_the_last_step_that_suffices() -> None:
+def test_the_prediction_goes_on_from_the_last_step_that_is_computed() -> None:
     planner = _planner(Continued(MujocoDynamics(Engine()), Drift(), slice(0, 1), 5))
     _, info = planner.step(planner.init(jax.random.key(0)), STATE, WINDOW._replace(steps=4))
     assert len(info.states) == 4 + 5
@@ -476,7 +476,9 @@ class Ripples:
         return Evaluations(np.asarray(self.cost(knots)), {}, {})
 
     def gradients(self, knots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        slope = jax.grad(lambda each: jnp.sum(jnp.where(jnp.isfinite(self.cost(each)), self.cost(each), 0.0)))(knots)
+        slope = jax.grad(
+            lambda candidates: jnp.sum(jnp.where(jnp.isfinite(self.cost(candidates)), self.cost(candidates), 0.0))
+        )(knots)
         return self.evaluate(knots).costs, np.array(slope)
 
     def lost(self, count: int) -> None:
@@ -533,8 +535,8 @@ def test_one_step_of_gauss_newton_solves_what_is_linear(jacobian: str) -> None:
 def test_rounds_of_differences_ask_for_one_rollout_each_and_one_at_first(rounds: int) -> None:
     class Bowl(Ripples):
         def evaluate(self, knots: np.ndarray) -> Evaluations:
-            found, flat = super().evaluate(knots), knots.reshape(len(knots), -1)
-            return found._replace(residuals={"miss": flat - 0.3}, curvatures={"miss": np.ones_like(flat)})
+            evaluations, flat = super().evaluate(knots), knots.reshape(len(knots), -1)
+            return evaluations._replace(residuals={"miss": flat - 0.3}, curvatures={"miss": np.ones_like(flat)})
 
     problem, search = Bowl(), _search()
     start = search.elites[0]
@@ -602,8 +604,8 @@ def test_differences_take_nothing_from_candidates_that_are_lost() -> None:
     here = Evaluations(np.array([0.6]), {"miss": np.array([[1.0]])}, {})
     directions, problem = np.ones((2, KNOTS, 1, 3), np.float32), Treacherous()
     linearization = Linearization(_search().mean, here, directions, problem.evaluate(directions))
-    found = GaussNewton(directions=2, step=0.1).derivatives(linearization, problem)  # type: ignore[arg-type]
-    np.testing.assert_allclose(found["miss"], [[-1.0], [0.0]])
+    derivatives = GaussNewton(directions=2, step=0.1).derivatives(linearization, problem)  # type: ignore[arg-type]
+    np.testing.assert_allclose(derivatives["miss"], [[-1.0], [0.0]])
 
 
 @dataclass(frozen=True)
@@ -644,9 +646,9 @@ def test_derivatives_that_are_not_finite_leave_the_plan_and_are_counted() -> Non
 def test_planners_of_one_problem_share_what_is_compiled() -> None:
     first = _planner(optimizers=CEM(samples=16, rounds=2, elites=3, decay=1.0))
     plan, info = first.step(first.init(jax.random.key(0)), STATE, WINDOW)
-    again = first.using((MPPI(samples=16, rounds=3, elites=3), GaussNewton(directions=16, elites=3)))
+    sharing = first.using((MPPI(samples=16, rounds=3, elites=3), GaussNewton(directions=16, elites=3)))
     assert first.using(MPPI(samples=2, rounds=1, elites=3)).compile(STATE, WINDOW) == 0  # few: one size
-    _, second = again.step(plan, STATE, WINDOW)
+    _, second = sharing.step(plan, STATE, WINDOW)
     assert info.compile_seconds > 0 and second.compile_seconds == 0
     assert second.cost <= info.cost
 
@@ -657,8 +659,8 @@ def test_the_fan_around_a_plan_is_of_its_problem_always_the_same_and_compiles_no
     costs, states = planner.fan(plan, STATE, WINDOW, count=12)
     assert costs.shape == (12,) and states.shape == (12, *info.states.shape)
     assert costs.min() >= 0.0 and np.isfinite(costs).all() and (costs != costs[0]).any()
-    again, _ = planner.fan(plan, STATE, WINDOW, count=12)
-    np.testing.assert_array_equal(costs, again)
+    same_costs, _ = planner.fan(plan, STATE, WINDOW, count=12)
+    np.testing.assert_array_equal(costs, same_costs)
     assert planner.step(plan, STATE, WINDOW)[1].compile_seconds == 0
 
 
@@ -715,9 +717,9 @@ def test_cem_update_ignores_what_is_not_finite() -> None:
     np.testing.assert_array_equal(candidates[cem.kept], search.mean)
 
     lost = np.full(32, np.inf)
-    nothing = cem.update(search, candidates, lost)
-    for kept, before in zip(nothing[:3], search[:3], strict=True):
-        np.testing.assert_array_equal(kept, before)
+    unchanged = cem.update(search, candidates, lost)
+    for after, before in zip(unchanged[:3], search[:3], strict=True):
+        np.testing.assert_array_equal(after, before)
     lost[9] = 1.0
     single = cem.update(search, candidates, lost)
     np.testing.assert_allclose(single.mean, 0.9 * candidates[9], rtol=1e-5)
@@ -734,6 +736,6 @@ def test_cem_population_shrinks_to_twice_the_elites() -> None:
 
 def test_noise_has_unit_variance_and_grows_smoother_with_its_exponent() -> None:
     noise = {e: coloured_noise(np.random.default_rng(0), (4000, 6, 1, 3), e) for e in (0.0, 2.0, 3.5)}
-    neighbours = [np.mean(each[:, 1:] * each[:, :-1]) for each in noise.values()]
-    np.testing.assert_allclose([each.std(axis=0) for each in noise.values()], 1, atol=0.05)
+    neighbours = [np.mean(values[:, 1:] * values[:, :-1]) for values in noise.values()]
+    np.testing.assert_allclose([values.std(axis=0) for values in noise.values()], 1, atol=0.05)
     assert abs(neighbours[0]) < 0.02 and neighbours[0] + 0.5 < neighbours[1] < neighbours[2]

@@ -69,7 +69,7 @@ def answer(server: viser.ViserServer, *lines: str) -> int:
 
 def client(server: viser.ViserServer) -> ClientConnection:
     """A client that came as a browser does, camera first."""
-    joined = connect(
+    connection = connect(
         f"ws://127.0.0.1:{server.get_port()}",
         origin=f"http://127.0.0.1:{server.get_port()}",  # type: ignore[arg-type]
         subprotocols=[Subprotocol(PROTOCOL)],
@@ -79,18 +79,18 @@ def client(server: viser.ViserServer) -> ClientConnection:
         open_timeout=SOON,
         close_timeout=SOON,
     )
-    known = len(server.get_clients())
-    say(joined, messages.ViewerCameraMessage((1, 0, 0, 0), (0, 0, 0), 1.0, 0.1, 9.0, 9, 9, (1, 0, 0), (0, 0, 1)))
-    eventually(lambda: len(server.get_clients()) > known)
-    return joined
+    before = len(server.get_clients())
+    send(connection, messages.ViewerCameraMessage((1, 0, 0, 0), (0, 0, 0), 1.0, 0.1, 9.0, 9, 9, (1, 0, 0), (0, 0, 1)))
+    eventually(lambda: len(server.get_clients()) > before)
+    return connection
 
 
-def say(speaker: Connection, message: messages.Message) -> None:
+def send(speaker: Connection, message: messages.Message) -> None:
     speaker.send(msgspec.msgpack.encode(message.as_serializable_dict()))
 
 
 def change(speaker: Connection, control: Any, **updates: object) -> None:
-    say(speaker, messages.GuiUpdateMessage(control._impl.uuid, updates))
+    send(speaker, messages.GuiUpdateMessage(control._impl.uuid, updates))
 
 
 def press(user: Connection, server: viser.ViserServer) -> None:
@@ -109,7 +109,7 @@ def eventually(holds: Callable[[], bool]) -> None:
         time.sleep(0.01)
 
 
-def hears(listening: Connection, text: str) -> bool:
+def receives(listening: Connection, text: str) -> bool:
     """Whether the client gets a message with this text soon."""
     while True:
         window = listening.recv(timeout=SOON)
@@ -183,8 +183,8 @@ def test_a_server_for_others_says_so_once_on_stderr(
     server = open_server(port=0)
     assert [answer(server, f"Host: {host}") for host in ("192.0.2.1", "evil.example")] == [200, 403]
     close_server(server)
-    said = capsys.readouterr()
-    assert said.out == "" and said.err == "host 127.0.0.1: anyone who reaches this machine can use the page\n"
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err == "host 127.0.0.1: anyone who reaches this machine can use the page\n"
 
 
 def test_page_answers_on_this_machine_only(server: viser.ViserServer) -> None:
@@ -226,9 +226,9 @@ def test_other_servers_of_viser_stay_as_they_are(monkeypatch: pytest.MonkeyPatch
     others.append(viser.ViserServer("127.0.0.1", 0, verbose=False))
     assert len(others) == 2
     assert answer(ours, "Host: evil.example") == 403
-    assert [answer(each, "Host: evil.example") for each in others] == [200, 200]
-    for each in (ours, *others):
-        close_server(each)
+    assert [answer(other, "Host: evil.example") for other in others] == [200, 200]
+    for other in (ours, *others):
+        close_server(other)
 
 
 def test_a_server_that_cannot_be_guarded_does_not_stay_open(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -291,8 +291,8 @@ def test_nobody_can_make_the_page_public(
     monkeypatch.setattr("viser._viser.ViserTunnel", lambda *_: dug.append("a tunnel"))
     assert server.request_share_url() is None
     with client(server) as stranger:
-        say(stranger, messages.ShareUrlRequest())
-        say(stranger, messages.ShareUrlDisconnect())
+        send(stranger, messages.ShareUrlRequest())
+        send(stranger, messages.ShareUrlDisconnect())
         press(stranger, server)  # is handled after these
     server._thread_executor.shutdown()  # Viser would dig the tunnel in there
     assert not dug and capsys.readouterr().out == ""
@@ -327,9 +327,9 @@ def test_a_malformed_message_harms_only_its_sender(
         assert closed.value.rcvd is not None
         assert closed.value.rcvd.code == (1009 if len(sent) > LARGEST_MESSAGE else 1011)
         text.content = "hello to others"
-        assert hears(other, "hello to others")
+        assert receives(other, "hello to others")
         with client(server) as late:
-            assert hears(late, "hello to others")
+            assert receives(late, "hello to others")
     assert capfd.readouterr() == ("", "") and not caplog.records, "a stranger must not write to our terminal"
 
 
@@ -366,7 +366,7 @@ def test_a_client_changes_a_value_or_nothing(
         eventually(lambda: marker.value == 0.5)
         assert vars(slider._impl) == state
         change(stranger, slider, value=7)
-        assert hears(other, slider._impl.uuid) and hears(other, slider._impl.uuid), "as created, then changed"
+        assert receives(other, slider._impl.uuid) and receives(other, slider._impl.uuid), "as created, then changed"
         assert slider.value == 7 and type(slider.value) is type(current)
 
 
@@ -391,7 +391,7 @@ def test_a_client_puts_handles_and_cameras_at_a_place_or_nowhere(
 ) -> None:
     handle = server.scene.add_transform_controls("/handle")
     with client(server) as stranger:
-        (known,) = server.get_clients().values()
+        (its_handle,) = server.get_clients().values()
         pose = {"wxyz": [1, 0, 0, 0], "position": [7, 8, 9]}
         camera = {"look_at": [0, 0, 0], "up_direction": [0, 0, 1], "fov": 1, "near": 1, "far": 2}
         camera |= {"image_height": 9, "image_width": 9}
@@ -399,11 +399,11 @@ def test_a_client_puts_handles_and_cameras_at_a_place_or_nowhere(
         rest = camera if kind is messages.ViewerCameraMessage else handled
         stranger.send(msgspec.msgpack.encode({"type": kind.__name__, **pose, **rest, **wrong}))
         press(stranger, server)
-        for placed in (handle, known.camera):
+        for placed in (handle, its_handle.camera):
             np.testing.assert_array_equal(placed.position, (0, 0, 0))
             np.testing.assert_array_equal(placed.wxyz, (1, 0, 0, 0))
         stranger.send(msgspec.msgpack.encode({"type": kind.__name__, **pose, **rest}))
-        moved = known.camera if kind is messages.ViewerCameraMessage else handle
+        moved = its_handle.camera if kind is messages.ViewerCameraMessage else handle
         eventually(lambda: (moved.position == (7, 8, 9)).all())
     assert not caplog.records
 
@@ -433,11 +433,11 @@ def test_what_a_client_says_of_a_form_that_is_none_is_not_kept(server: viser.Vis
     """Viser keeps it for all clients to come, under any name a client makes up."""
     marker = server.gui.add_slider("marker", 0.0, 1.0, 0.1, 0.0)
     with client(server) as stranger:
-        say(stranger, messages.GuiFormDirtyMessage("made up"))
+        send(stranger, messages.GuiFormDirtyMessage("made up"))
         change(stranger, marker, value=0.5)
         eventually(lambda: marker.value == 0.5)
-    kept = server._websock_server._broadcast_buffer.message_from_id.values()
-    assert not any(isinstance(each, messages.GuiFormDirtyMessage) for each in kept)
+    stored = server._websock_server._broadcast_buffer.message_from_id.values()
+    assert not any(isinstance(message, messages.GuiFormDirtyMessage) for message in stored)
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="open files cannot be counted here")
@@ -473,12 +473,12 @@ def test_nothing_is_left_of_closed_servers(capfd: pytest.CaptureFixture) -> None
 @example(math.nan, 0.5, 1.5)
 @example(math.inf, 0.5, 1.5)
 def test_a_number_lies_within_its_bounds(value: object, low: float, width: float) -> None:
-    kept = within(value, low, low + width)
-    assert isinstance(kept, float) and low <= kept <= low + width
+    number = within(value, low, low + width)
+    assert isinstance(number, float) and low <= number <= low + width
     if isinstance(value, float) and low <= value <= low + width:
-        assert kept == value
+        assert number == value
     if not isinstance(value, int | np.floating) and not (isinstance(value, float) and math.isfinite(value)):
-        assert kept == low
+        assert number == low
 
 
 @pytest.mark.parametrize(("value", "expected"), [(3, 2.0), (-1, 0.5), (1, 1.0), (10**400, 2.0), (-math.inf, 0.5)])
@@ -489,12 +489,12 @@ def test_a_number_out_of_bounds_goes_to_the_nearest(value: float, expected: floa
 @given(st.one_of(anything, st.lists(anything, min_size=3, max_size=3)))
 def test_a_vector_lies_in_its_box(value: object) -> None:
     low, high = (-1.0, 0.0, 2.0), (1.0, 0.5, 2.0)
-    kept = vector(value, low, high)
-    assert kept.shape == (3,) and kept.dtype == float
-    assert (kept >= low).all() and (kept <= high).all()
+    inside = vector(value, low, high)
+    assert inside.shape == (3,) and inside.dtype == float
+    assert (inside >= low).all() and (inside <= high).all()
     parts = value if isinstance(value, list) and len(value) == 3 else low
     if not isinstance(value, np.ndarray):
-        np.testing.assert_array_equal(kept, [within(*each) for each in zip(parts, low, high, strict=True)])
+        np.testing.assert_array_equal(inside, [within(*part) for part in zip(parts, low, high, strict=True)])
 
 
 @pytest.mark.parametrize("kind", [tuple, list, np.array])
@@ -505,7 +505,7 @@ def test_a_vector_in_its_box_is_kept(kind: Callable[[Any], object]) -> None:
 @given(anything, st.lists(st.text(), min_size=1))
 def test_an_option_is_one_of_those_offered(value: object, offered: list[str]) -> None:
     assert option(value, offered) == (value if isinstance(value, str) and value in offered else offered[0])
-    assert all(option(each, offered) == each for each in offered)
+    assert all(option(text, offered) == text for text in offered)
 
 
 @given(anything)
@@ -560,8 +560,8 @@ def test_a_server_behind_a_proxy_answers_it() -> None:
 
 
 def test_an_address_that_is_free_stays_free_after_it_was_asked_for() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as found:
-        port = found.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        port = listening.getsockname()[1]
         with pytest.raises(InputError, match=f"port {port}"):
             require_address("127.0.0.1", port)
     require_address("127.0.0.1", port)

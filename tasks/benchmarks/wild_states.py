@@ -96,7 +96,7 @@ def sizes(bench: Bench, body: str, field: str) -> list[Row]:
 # States.
 
 
-class Case(NamedTuple):
+class StressCase(NamedTuple):
     """A start (L, 13), targets (48, J, 3) [rad], a torque about y on each link [N m], and an optional law to check."""
 
     axis: str
@@ -144,14 +144,14 @@ class Start:
         targets: np.ndarray | None = None,
         torque: float = 0.0,
         law: Law | None = None,
-    ) -> Case:
-        """Return the case of this start after a change in place, by default none; see `Case`."""
+    ) -> StressCase:
+        """Return the case of this start after a change in place, by default none; see `StressCase`."""
         state = self.state.copy()
         change(state)
-        return Case(axis, value, state, self.controls if targets is None else targets, torque, law)
+        return StressCase(axis, value, state, self.controls if targets is None else targets, torque, law)
 
 
-def cases(kick: Kick, controls: np.ndarray) -> list[Case]:
+def cases(kick: Kick, controls: np.ndarray) -> list[StressCase]:
     """Return starts that do not occur in kicks, each with the quantity that is varied."""
     state = kick.start()
     state[-1, :2] = 3.0, 0.0
@@ -164,7 +164,7 @@ def _put(rows: Any, columns: Any, value: Any) -> Change:
     return lambda state: state.__setitem__((rows, columns), value)
 
 
-def _speeds(start: Start) -> Iterator[Case]:
+def _speeds(start: Start) -> Iterator[StressCase]:
     law = keeps_energy(start.kick.scene)
     for speed in (5.0, 10.0, 20.0, 50.0):
         value, slanting = f"{speed:g} m/s", (0.6 * speed, 0.0, 0.8 * speed)
@@ -182,7 +182,7 @@ def _shoot_at(foot: int, speed: float, state: np.ndarray) -> None:
     state[-1, packed.VELOCITY] = -speed, 0.0, 0.0
 
 
-def _angular_speeds(start: Start) -> Iterator[Case]:
+def _angular_speeds(start: Start) -> Iterator[StressCase]:
     law = keeps_energy(start.kick.scene)
     axes = np.random.default_rng(0).standard_normal((len(start.state) - 1, 3))
     axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
@@ -193,12 +193,12 @@ def _angular_speeds(start: Start) -> Iterator[Case]:
         yield start.case("spin of every link", value, _put(slice(0, -1), packed.ANGULAR_VELOCITY, speed * axes))
 
 
-def _torques(start: Start) -> Iterator[Case]:
+def _torques(start: Start) -> Iterator[StressCase]:
     for torque in (10.0, 100.0, 1e3, 1e4):
         yield start.case("torque on every link", f"{torque:g} N m", torque=torque)
 
 
-def _joint_targets(start: Start) -> Iterator[Case]:
+def _joint_targets(start: Start) -> Iterator[StressCase]:
     shape = start.controls.shape
     for name, bound in zip(("lower", "upper"), start.kick.scene.limits, strict=True):
         for factor in (1.0, 2.0, 5.0):
@@ -208,7 +208,7 @@ def _joint_targets(start: Start) -> Iterator[Case]:
         yield start.case("joint targets", f"{angle:.3g} rad about every axis", targets=np.full(shape, angle))
 
 
-def _overlaps(start: Start) -> Iterator[Case]:
+def _overlaps(start: Start) -> Iterator[StressCase]:
     kick, foot = start.kick, start.kick.foot
     for depth in (0.01, 0.05, 0.1):
         yield start.case("ball inside the foot", f"{100 * depth:g} cm", _into_foot(kick, depth))
@@ -230,7 +230,7 @@ def _ball_to(link: int, state: np.ndarray) -> None:
     state[-1, packed.POSITION] = state[link, packed.POSITION]
 
 
-def _heights(start: Start) -> Iterator[Case]:
+def _heights(start: Start) -> Iterator[StressCase]:
     for height in (1.0, 10.0, 100.0):
         yield start.case("human above the ground", f"{height:g} m", partial(_lift, height))
 
@@ -239,7 +239,7 @@ def _lift(height: float, state: np.ndarray) -> None:
     state[:-1, 2] += height
 
 
-def _wrong_states(start: Start) -> Iterator[Case]:
+def _wrong_states(start: Start) -> Iterator[StressCase]:
     yield start.case("all links in one place", "1 m up", _put(slice(None), packed.POSITION, (0.0, 0.0, 1.0)))
     yield start.case("human on its head", "pelvis turned by pi", _upside_down)
     for scale in (-1.0, 0.5, 2.0):
