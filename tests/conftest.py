@@ -51,6 +51,14 @@ def nothing_compiled_is_kept() -> Iterator[None]:
     gc.collect()
 
 
+@pytest.fixture(scope="module")
+def quick_compilation() -> Iterator[None]:
+    """Compile without optimisation, for small problems, which take longer to compile than to solve."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
 @pytest.fixture(scope="session")
 def scene() -> Scene:
     """The kick's scene."""

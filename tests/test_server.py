@@ -1,6 +1,5 @@
-"""The server behind the page: who may enter, what a client can do to it and to others, and what it leaves behind."""
+"""The server behind the page: who may enter, where it listens, and what it leaves behind."""
 
-import math
 import os
 import re
 import socket
@@ -11,39 +10,14 @@ from contextlib import ExitStack, closing
 from typing import Any
 from urllib.request import urlopen
 
-import msgspec
-import numpy as np
 import pytest
 import viser
 import websockets.asyncio.server as listener
-import zstandard
-from hypothesis import example, given
-from hypothesis import strategies as st
-from viser import _messages as messages
+from page_clients import SOON, UPGRADE, answer, ask, client, eventually, press
 from websockets.datastructures import Headers
-from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import ClientConnection, connect
-from websockets.sync.connection import Connection
-from websockets.typing import Subprotocol
 
 from larp_model.errors import InputError
-from viewer.checked import alike, flag, option, vector, within
-from viewer.server import LARGEST_MESSAGE, address_of, admits, close_server, names_of, open_server, require_address
-
-PROTOCOL = f"viser-v{viser.__version__}"
-UPGRADE = (
-    "Upgrade: websocket",
-    "Connection: Upgrade",
-    "Sec-WebSocket-Version: 13",
-    "Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==",
-    f"Sec-WebSocket-Protocol: {PROTOCOL}",
-)
-SOON = 5.0  # s; nothing here takes longer
-
-anything = st.one_of(
-    st.none(), st.booleans(), st.integers(), st.floats(), st.text(), st.lists(st.floats()), st.binary(),
-    st.sampled_from([10**400, -(10**400), np.float32(0.5), np.array(0.5), np.zeros((3, 2)), np.ones(3), {}, object()]),
-)  # fmt: skip
+from viewer.server import address_of, admits, close_server, names_of, open_server, require_address
 
 
 @pytest.fixture
@@ -51,72 +25,6 @@ def server() -> Iterator[viser.ViserServer]:
     server = open_server(port=0)
     yield server
     close_server(server)
-
-
-def ask(server: viser.ViserServer, *lines: str) -> socket.socket:
-    """Send a request with these headers, in which PORT is the server's."""
-    sent = socket.create_connection(("127.0.0.1", server.get_port()), timeout=SOON)
-    text = "\r\n".join(["GET / HTTP/1.1", *lines, "", ""]).replace("PORT", str(server.get_port()))
-    sent.sendall(text.encode())
-    return sent
-
-
-def answer(server: viser.ViserServer, *lines: str) -> int:
-    """The status of the answer to these headers."""
-    with ask(server, *lines) as sent:
-        return int(sent.recv(64).split()[1])
-
-
-def client(server: viser.ViserServer) -> ClientConnection:
-    """A client that came as a browser does, camera first."""
-    connection = connect(
-        f"ws://127.0.0.1:{server.get_port()}",
-        origin=f"http://127.0.0.1:{server.get_port()}",  # type: ignore[arg-type]
-        subprotocols=[Subprotocol(PROTOCOL)],
-        compression=None,
-        max_size=None,
-        proxy=None,
-        open_timeout=SOON,
-        close_timeout=SOON,
-    )
-    before = len(server.get_clients())
-    send(connection, messages.ViewerCameraMessage((1, 0, 0, 0), (0, 0, 0), 1.0, 0.1, 9.0, 9, 9, (1, 0, 0), (0, 0, 1)))
-    eventually(lambda: len(server.get_clients()) > before)
-    return connection
-
-
-def send(speaker: Connection, message: messages.Message) -> None:
-    speaker.send(msgspec.msgpack.encode(message.as_serializable_dict()))
-
-
-def change(speaker: Connection, control: Any, **updates: object) -> None:
-    send(speaker, messages.GuiUpdateMessage(control._impl.uuid, updates))
-
-
-def press(user: Connection, server: viser.ViserServer) -> None:
-    """Press a button, and wait until that is answered in a thread of the server."""
-    pressed = threading.Event()
-    button = server.gui.add_button("press")
-    button.on_click(lambda _: pressed.set())
-    change(user, button, value=True)
-    assert pressed.wait(SOON)
-
-
-def eventually(holds: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + SOON
-    while not holds():
-        assert time.monotonic() < deadline, "it never came"
-        time.sleep(0.01)
-
-
-def receives(listening: Connection, text: str) -> bool:
-    """Whether the client gets a message with this text soon."""
-    while True:
-        window = listening.recv(timeout=SOON)
-        assert isinstance(window, bytes)
-        size = int.from_bytes(window[8:16], "little")
-        if text.encode() in zstandard.decompress(window[16 : 16 + size], int.from_bytes(window[:8], "little")):
-            return True
 
 
 @pytest.mark.parametrize("upgrade", [(), UPGRADE], ids=["page", "websocket"])
@@ -284,162 +192,6 @@ def test_an_impossible_port_is_named(port: Any) -> None:
         open_server(port=port)
 
 
-def test_nobody_can_make_the_page_public(
-    server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    dug: list[object] = []
-    monkeypatch.setattr("viser._viser.ViserTunnel", lambda *_: dug.append("a tunnel"))
-    assert server.request_share_url() is None
-    with client(server) as stranger:
-        send(stranger, messages.ShareUrlRequest())
-        send(stranger, messages.ShareUrlDisconnect())
-        press(stranger, server)  # is handled after these
-    server._thread_executor.shutdown()  # Viser would dig the tunnel in there
-    assert not dug and capsys.readouterr().out == ""
-
-
-@pytest.mark.parametrize(
-    "sent",
-    [
-        b"",
-        b"\xc1",
-        "a text",
-        msgspec.msgpack.encode([1, 2]),
-        msgspec.msgpack.encode({"uuid": "x"}),
-        msgspec.msgpack.encode({"type": "NoSuchMessage"}),
-        msgspec.msgpack.encode({"type": ["GuiUpdateMessage"]}),
-        msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "x"}),
-        msgspec.msgpack.encode({"type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0]}),
-        b"\x91" * 100_000 + b"\xc0",
-        bytes(LARGEST_MESSAGE + 1),
-    ],
-    ids=lambda sent: repr(sent[:40]),
-)
-def test_a_malformed_message_harms_only_its_sender(
-    server: viser.ViserServer, sent: str | bytes, capfd: pytest.CaptureFixture, caplog: pytest.LogCaptureFixture
-) -> None:
-    text = server.gui.add_markdown("before")
-    with client(server) as other, client(server) as stranger:
-        stranger.send(sent)
-        with pytest.raises(ConnectionClosed) as closed:
-            while True:
-                stranger.recv(timeout=SOON)
-        assert closed.value.rcvd is not None
-        assert closed.value.rcvd.code == (1009 if len(sent) > LARGEST_MESSAGE else 1011)
-        text.content = "hello to others"
-        assert receives(other, "hello to others")
-        with client(server) as late:
-            assert receives(late, "hello to others")
-    assert capfd.readouterr() == ("", "") and not caplog.records, "a stranger must not write to our terminal"
-
-
-@pytest.mark.parametrize(
-    "updates",
-    [
-        {"value": math.nan},
-        {"value": math.inf},
-        {"value": 1e300},
-        {"value": True},
-        {"value": "7"},
-        {"value": None},
-        {"value": [7]},
-        {"value": 7, "removed": True},
-        {"removed": True},
-        {"update_cb": "no list"},
-        {"sync_cb": "no function"},
-        {"props": {"visible": True}},
-        {"no_such": 1},
-        {},
-    ],
-    ids=str,
-)
-@pytest.mark.parametrize("current", [1, 1.0], ids=["integer", "float"])
-def test_a_client_changes_a_value_or_nothing(
-    server: viser.ViserServer, updates: dict[str, object], current: float
-) -> None:
-    slider = server.gui.add_slider("slider", 0, 10, 1, current)
-    marker = server.gui.add_slider("marker", 0.0, 1.0, 0.1, 0.0)
-    state = vars(slider._impl).copy()
-    with client(server) as other, client(server) as stranger:
-        change(stranger, slider, **updates)
-        change(stranger, marker, value=0.5)
-        eventually(lambda: marker.value == 0.5)
-        assert vars(slider._impl) == state
-        change(stranger, slider, value=7)
-        assert receives(other, slider._impl.uuid) and receives(other, slider._impl.uuid), "as created, then changed"
-        assert slider.value == 7 and type(slider.value) is type(current)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"position": [math.nan, 0, 0]},
-        {"position": [1, 2]},
-        {"position": "123"},
-        {"position": ["a"]},
-        {"position": None},
-        {"wxyz": [1, 0, 0]},
-        {"wxyz": [math.inf, 0, 0, 0]},
-        {"name": ["/handle"]},
-        {"owner": {}},
-    ],
-    ids=str,
-)
-@pytest.mark.parametrize("kind", [messages.TransformControlsUpdateMessage, messages.ViewerCameraMessage])
-def test_a_client_puts_handles_and_cameras_at_a_place_or_nowhere(
-    server: viser.ViserServer, wrong: dict[str, object], kind: type[messages.Message], caplog: pytest.LogCaptureFixture
-) -> None:
-    handle = server.scene.add_transform_controls("/handle")
-    with client(server) as stranger:
-        (its_handle,) = server.get_clients().values()
-        pose = {"wxyz": [1, 0, 0, 0], "position": [7, 8, 9]}
-        camera = {"look_at": [0, 0, 0], "up_direction": [0, 0, 1], "fov": 1, "near": 1, "far": 2}
-        camera |= {"image_height": 9, "image_width": 9}
-        handled = {"name": "/handle", "owner": server.scene._owner_id}
-        rest = camera if kind is messages.ViewerCameraMessage else handled
-        stranger.send(msgspec.msgpack.encode({"type": kind.__name__, **pose, **rest, **wrong}))
-        press(stranger, server)
-        for placed in (handle, its_handle.camera):
-            np.testing.assert_array_equal(placed.position, (0, 0, 0))
-            np.testing.assert_array_equal(placed.wxyz, (1, 0, 0, 0))
-        stranger.send(msgspec.msgpack.encode({"type": kind.__name__, **pose, **rest}))
-        moved = its_handle.camera if kind is messages.ViewerCameraMessage else handle
-        eventually(lambda: (moved.position == (7, 8, 9)).all())
-    assert not caplog.records
-
-
-@pytest.mark.parametrize(
-    ("add", "value"),
-    [
-        (lambda gui: gui.add_checkbox("", False), True),
-        (lambda gui: gui.add_dropdown("", ("a", "b")), "b"),
-        (lambda gui: gui.add_text("", "before"), "after"),
-        (lambda gui: gui.add_number("", 1.5), 2),
-        (lambda gui: gui.add_vector3("", (0.0, 0.0, 0.0)), (1, 2.5, 3)),
-        (lambda gui: gui.add_rgb("", (0, 0, 0)), (1, 2, 3)),
-        (lambda gui: gui.add_button_group("", ("a", "b")), "b"),
-    ],
-)
-def test_a_client_can_use_every_control(
-    server: viser.ViserServer, add: Callable[[viser.GuiApi], Any], value: object
-) -> None:
-    control = add(server.gui)
-    with client(server) as user:
-        change(user, control, value=value)
-        eventually(lambda: control.value == value)
-
-
-def test_what_a_client_says_of_a_form_that_is_none_is_not_kept(server: viser.ViserServer) -> None:
-    """Viser keeps it for all clients to come, under any name a client makes up."""
-    marker = server.gui.add_slider("marker", 0.0, 1.0, 0.1, 0.0)
-    with client(server) as stranger:
-        send(stranger, messages.GuiFormDirtyMessage("made up"))
-        change(stranger, marker, value=0.5)
-        eventually(lambda: marker.value == 0.5)
-    stored = server._websock_server._broadcast_buffer.message_from_id.values()
-    assert not any(isinstance(message, messages.GuiFormDirtyMessage) for message in stored)
-
-
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="open files cannot be counted here")
 def test_nothing_is_left_of_closed_servers(capfd: pytest.CaptureFixture) -> None:
     """Neither threads nor sockets nor event loops; also where clients have called back, or do not answer."""
@@ -467,65 +219,6 @@ def test_nothing_is_left_of_closed_servers(capfd: pytest.CaptureFixture) -> None
     eventually(lambda: set(threading.enumerate()) <= threads)
     eventually(lambda: len(os.listdir("/proc/self/fd")) <= files)
     assert capfd.readouterr() == ("", "")
-
-
-@given(anything, st.floats(-1e6, 1e6), st.floats(0.0, 1e6))
-@example(math.nan, 0.5, 1.5)
-@example(math.inf, 0.5, 1.5)
-def test_a_number_lies_within_its_bounds(value: object, low: float, width: float) -> None:
-    number = within(value, low, low + width)
-    assert isinstance(number, float) and low <= number <= low + width
-    if isinstance(value, float) and low <= value <= low + width:
-        assert number == value
-    if not isinstance(value, int | np.floating) and not (isinstance(value, float) and math.isfinite(value)):
-        assert number == low
-
-
-@pytest.mark.parametrize(("value", "expected"), [(3, 2.0), (-1, 0.5), (1, 1.0), (10**400, 2.0), (-math.inf, 0.5)])
-def test_a_number_out_of_bounds_goes_to_the_nearest(value: float, expected: float) -> None:
-    assert within(value, 0.5, 2.0) == expected
-
-
-@given(st.one_of(anything, st.lists(anything, min_size=3, max_size=3)))
-def test_a_vector_lies_in_its_box(value: object) -> None:
-    low, high = (-1.0, 0.0, 2.0), (1.0, 0.5, 2.0)
-    inside = vector(value, low, high)
-    assert inside.shape == (3,) and inside.dtype == float
-    assert (inside >= low).all() and (inside <= high).all()
-    parts = value if isinstance(value, list) and len(value) == 3 else low
-    if not isinstance(value, np.ndarray):
-        np.testing.assert_array_equal(inside, [within(*part) for part in zip(parts, low, high, strict=True)])
-
-
-@pytest.mark.parametrize("kind", [tuple, list, np.array])
-def test_a_vector_in_its_box_is_kept(kind: Callable[[Any], object]) -> None:
-    np.testing.assert_array_equal(vector(kind((0.5, -9.0, 9.0)), (-1, -1, -1), (1, 1, 1)), (0.5, -1.0, 1.0))
-
-
-@given(anything, st.lists(st.text(), min_size=1))
-def test_an_option_is_one_of_those_offered(value: object, offered: list[str]) -> None:
-    assert option(value, offered) == (value if isinstance(value, str) and value in offered else offered[0])
-    assert all(option(text, offered) == text for text in offered)
-
-
-@given(anything)
-def test_a_flag_is_true_only_where_it_is_true(value: object) -> None:
-    assert flag(value) is (isinstance(value, bool) and value)
-
-
-@given(anything, st.sampled_from([True, 1, 1.0, "text", (0.0, 0.0), (), None]))
-def test_what_may_stand_for_a_value_is_of_its_kind_and_can_be_sent_to_all(value: object, current: object) -> None:
-    kinds = {bool: bool, int: (int, float), float: (int, float), str: str, tuple: list}
-    if alike(value, current):
-        assert isinstance(value, kinds[type(current)])  # type: ignore[arg-type]
-        msgspec.msgpack.encode(int(value) if type(current) is int else value)  # type: ignore[call-overload]
-
-
-@pytest.mark.parametrize(
-    ("value", "current"), [(False, True), (2.5, 1), (2, 1.0), ("", "text"), ([1, 2.5], (0.0, 0.0)), ([], ())]
-)
-def test_what_a_browser_sends_of_a_control_may_stand_for_its_value(value: object, current: object) -> None:
-    assert alike(value, current)
 
 
 @pytest.mark.parametrize(
