@@ -39,7 +39,7 @@ from tasks.train import OVER_PHYSICS
 # Episodes that weights are checked on, and those drawn at a time.
 HELD_OUT, DRAWN = 64, 256
 # Shares of the time: random episodes, and rollouts of the planner's candidates.
-TRUTH, PLANS = 0.15, 0.2
+RANDOM_SHARE, CANDIDATE_SHARE = 0.15, 0.2
 # Rollouts taken from each plan, and more kicks than are planned in any time.
 ROLLOUTS_PER_PLAN, KICKS = 128, 1000
 # The check at the end [s], and the least that is worth beginning [min].
@@ -149,10 +149,10 @@ class Clock:
 def trained(kick: Kick, model: Model, seed: int, clock: Clock) -> Weights:
     """Return weights trained, as long as there is time, on random episodes around a kick and on plans' candidates."""
     begin, parts = time.perf_counter(), list[Episodes]()
-    while not parts or (time.perf_counter() - begin < TRUTH * clock.budget and len(parts) * DRAWN < MOST):
+    while not parts or (time.perf_counter() - begin < RANDOM_SHARE * clock.budget and len(parts) * DRAWN < MOST):
         parts.append(random_episodes(kick.scene, kick.reference, DRAWN, seed + len(parts))[0])
     random = truth_episodes.join(parts)
-    candidates = tried_episodes(kick, KICKS, ROLLOUTS_PER_PLAN, seed, PLANS * clock.budget)
+    candidates = tried_episodes(kick, KICKS, ROLLOUTS_PER_PLAN, seed, CANDIDATE_SHARE * clock.budget)
     clock.tell(f"{len(random.states)} random episodes, {len(candidates.states)} of plans")
     recipe = replace(OVER_PHYSICS, updates=MOST, seed=seed)
     sources = [(episodes, float(len(episodes.states))) for episodes in (random, candidates)]

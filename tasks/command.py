@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
-from typing import Any, NoReturn, TextIO
+from typing import Any, NoReturn, TextIO, cast
 
 import jax
 import tyro
@@ -37,7 +37,7 @@ def run(task: Callable[..., None] | dict[str, Callable[..., None]], arguments: l
     its traceback. A command goes on when the reader of its output ends: see `Stream`.
     """
     out, err = Stream(sys.stdout), Stream(sys.stderr)
-    with redirect_stdout(out), redirect_stderr(err), _interruptible():  # type: ignore[type-var]
+    with redirect_stdout(cast(TextIO, out)), redirect_stderr(cast(TextIO, err)), _interruptible():
         try:
             if isinstance(task, dict):
                 tyro.extras.subcommand_cli_from_dict(task, args=arguments)

@@ -41,4 +41,5 @@ def exploration_std(scene: Scene) -> np.ndarray:
 def smooth_noise(random: np.random.Generator, count: int, steps: int, knots: int, scale: np.ndarray) -> np.ndarray:
     """Return smooth noise (count, steps, J, 3): splines through `knots` normal values of deviation `scale` (J, 3)."""
     values = random.standard_normal((count, knots, *scale.shape)) * scale
-    return CubicSpline(np.linspace(0.0, 1.0, knots), values, axis=1)(np.linspace(0.0, 1.0, steps))
+    noise: np.ndarray = CubicSpline(np.linspace(0.0, 1.0, knots), values, axis=1)(np.linspace(0.0, 1.0, steps))
+    return noise

@@ -53,7 +53,7 @@ def events(scene: Scene, states: np.ndarray, free: np.ndarray) -> dict[str, Any]
 def gap(scene: Scene, truth: np.ndarray, model: np.ndarray, start: int, free: np.ndarray) -> dict[str, Any]:
     """Return every event in the ground truth and in the model, and how far apart the two are.
 
-    truth: states (T, L, 13). model: predicted states (T', L, 13), the first of them the truth's in row `start`.
+    truth: states (T, L, 13). model: predicted states (T', L, 13), the first of them the ground truth's in row `start`.
     free: (T, 13), states of the untouched ball.
     launch_error: |v - v'| / |v|; launch_angle_deg: between the two; links_m, joints_deg: mean distance of the human's
     links and mean angle between its joints, at the true contact.

@@ -95,7 +95,7 @@ def main(
         allow_host: names of hosts by which a proxy before the page is reached, such as hub.example.org.
         video: a film of the kick to write: FILE.mp4 or FILE.gif.
         quiet: print nothing.
-        json: print the summary as JSON, and on stderr what else is told.
+        json: print the summary as JSON, and all other output on stderr.
     """
     goal = check_target(target)
     human = HumanOptions(reference, names, height, mass, body, self_contact)

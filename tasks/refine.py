@@ -169,7 +169,7 @@ def main(
     Args:
         out: file of the refined key poses.
         rounds: of the search.
-        population: key poses tried in a round.
+        population: key poses evaluated in a round.
         kicks: of each, all but the first of them disturbed.
         size: of the disturbances; 1 moves the ball as far as the benchmark does.
         spread: of the search at first.

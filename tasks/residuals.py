@@ -32,12 +32,14 @@ def pose(states: Array, controls: Array, context: Context, human: slice = slice(
     """
     links = packed.position(states[: len(controls), human])
     apart = links - links[:, :1] - context.reference
-    return (apart * context.reference_share[:, None, None]).reshape(len(controls), -1)
+    weighted: Array = apart * context.reference_share[:, None, None]
+    return weighted.reshape(len(controls), -1)
 
 
 def effort(states: Array, controls: Array, context: Any) -> Array:
     """Return the differences of joint targets (H, J, 3) from the context's `controls`, (H, 3 J) [rad]."""
-    return (controls - context.controls).reshape(len(controls), -1)
+    difference: Array = controls - context.controls
+    return difference.reshape(len(controls), -1)
 
 
 def apart(states: Array, controls: Array, context: Any, link: int, other: int) -> Array:

@@ -24,7 +24,7 @@ def noisy(scene: Scene, random: np.random.Generator) -> Callable[[np.ndarray], n
     body, human = scene.bodies[0], scene.rows(scene.bodies[0].name)
 
     def sense(state: np.ndarray) -> np.ndarray:
-        noisy_state = state.copy()
+        noisy_state: np.ndarray = state.copy()
         for columns in (packed.VELOCITY, packed.ANGULAR_VELOCITY):
             noisy_state[:, columns] *= 1.0 + VELOCITIES * random.standard_normal((len(state), 3))
         true = Rotation.from_quat(state[human, packed.ORIENTATION], scalar_first=True)

@@ -12,8 +12,8 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from larp_model.engines.mujoco import SUBSTEPS, Truth
-from mpc import Dynamics, Optimizer, Planner, Verified
-from mpc.loop import Execution, Phase, Window, World, execute
+from mpc import Dynamics, Optimizer, Planner, Verified, Window
+from mpc.loop import Execution, Phase, World, execute
 from tasks.models import NO_WEIGHTS, DynamicsName, models_of
 from tasks.presets import PRESETS, Preset, PresetName, Seconds, preset_of, usable, within
 from tasks.run import AFTER_CONTACT, Run

@@ -38,7 +38,7 @@ KNOTS = 6
 SEARCH = 0.5
 # Steps from the strike until the kick has swung out, until it counts fully that the human stands, and until the joint
 # targets are the stance's.
-SWUNG, SETTLED, STANCE = 20, 50, 50
+SWING_END, FULL_BALANCE, STANCE = 20, 50, 50
 # Joint targets that are not zero when one stands: links and angles about x and y [rad], of the left side.
 KNEES, ELBOWS = 0.5, 0.25
 
@@ -77,12 +77,14 @@ class Standing:
 
     def balance(self, states: Array, controls: Array, context: StandingContext) -> Array:
         """Return `capture_point` (H, 2) [m], weighted by the context's `balance_share` (H,)."""
-        return context.balance_share[:, None] * self.capture_point(states)
+        weighted: Array = context.balance_share[:, None] * self.capture_point(states)
+        return weighted
 
     def feet_above(self, states: Array, controls: Array, context: StandingContext) -> Array:
         """Return the heights of both feet above the ground (H, 2) [m], weighted by `balance_share` (H,)."""
         above = packed.position(states)[:, self.feet, 2] - self.lying
-        return context.balance_share[:, None] * jnp.maximum(above, 0.0)
+        weighted: Array = context.balance_share[:, None] * jnp.maximum(above, 0.0)
+        return weighted
 
     def lean(self, states: Array, controls: Array, context: StandingContext) -> Array:
         """Return the horizontal parts of the upward axes of pelvis and torso (H, 4)."""
@@ -103,11 +105,11 @@ class Standing:
     def window(self, step: int) -> Window:
         """Return the joint targets from a step on and, as the residuals' context, how much standing counts."""
         ahead = step - self.reference.strike + np.arange(HORIZON)
-        share = smooth((ahead - 0.5 * SWUNG) / (STANCE - 0.5 * SWUNG))[:, None, None]
-        last = self.reference.window(self.reference.strike + SWUNG // 2, 1)[1]
+        share = smooth((ahead - 0.5 * SWING_END) / (STANCE - 0.5 * SWING_END))[:, None, None]
+        last = self.reference.window(self.reference.strike + SWING_END // 2, 1)[1]
         controls = (1.0 - share) * last + share * self.stance
         context = StandingContext(
-            balance_share=np.clip((ahead - SWUNG) / (SETTLED - SWUNG), 0.0, 1.0),
+            balance_share=np.clip((ahead - SWING_END) / (FULL_BALANCE - SWING_END), 0.0, 1.0),
             pelvis_height=np.full((HORIZON, 1), 0.95 * self.height),
             controls=controls,
         )

@@ -26,7 +26,8 @@ def untouched(scene: Scene, state: np.ndarray, steps: int, substeps: int = FINE_
 def is_struck(ball: np.ndarray, free: np.ndarray) -> np.ndarray:
     """Return a mask (*) of the states (*, 13) of the ball after the strike. free: (*, 13), see `untouched`."""
     apart = ball[..., packed.VELOCITY] - free[..., packed.VELOCITY]
-    return np.linalg.norm(apart, axis=-1) > STRUCK
+    mask: np.ndarray = np.linalg.norm(apart, axis=-1) > STRUCK
+    return mask
 
 
 def strike_step(states: np.ndarray, free: np.ndarray) -> int | None:

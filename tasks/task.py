@@ -8,8 +8,8 @@
                         + ...                                     costs that the task adds
     subject to            S_{t+1} = dynamics(S_t, Q_t),  Q = Q^ref + spline(theta)
 
-A task says what is wanted. `session.Session` plans it through LARP or MuJoCo and executes the plan in MuJoCo;
-`run.Run` keeps and shows the result.
+A task states scene, reference, goal and costs. `session.Session` plans it through LARP or MuJoCo and executes the plan
+in MuJoCo; `run.Run` keeps and shows the result.
 """
 
 from __future__ import annotations
@@ -181,7 +181,7 @@ class Task(ABC):
         for name, value in (("ball_offset", ball_offset), ("ball_velocity", ball_velocity)):
             if np.shape(value) != (2,) or not np.isfinite(value).all():
                 raise InputError(f"{name} is {value}, but must be two finite numbers")
-        state = self.reference.states[0].copy()
+        state: np.ndarray = self.reference.states[0].copy()
         ball = state[self.ball]
         ball[:2] += ball_offset
         radius = self.scene.links[self.ball].radius

@@ -14,7 +14,7 @@ from mpc import evaluate
 from tasks import kick, sensing
 from tasks.gap import events, gap
 from tasks.motions.references import standing_on_ground
-from tasks.standing import HORIZON, SWUNG, Standing
+from tasks.standing import HORIZON, SWING_END, Standing
 from tasks.strike import strike_step
 from tasks.targets import random_roll
 
@@ -60,7 +60,7 @@ def test_standing_still_costs_next_to_nothing_and_what_leads_to_a_fall_costs(
 def test_the_targets_go_from_the_kick_to_the_stance_without_a_jump(task: kick.Kick) -> None:
     standing = Standing(task.scene, task.reference)
     controls = np.stack([standing.window(step).reference[0] for step in range(task.reference.strike, 200)])
-    last = task.reference.window(task.reference.strike + SWUNG // 2, 1)[1]
+    last = task.reference.window(task.reference.strike + SWING_END // 2, 1)[1]
     np.testing.assert_array_equal(controls[0], last[0])
     assert np.abs(np.diff(controls, axis=0)).max() < 0.1
     np.testing.assert_array_equal(controls[-1], standing.stance)

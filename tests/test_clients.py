@@ -23,7 +23,7 @@ def server() -> Iterator[viser.ViserServer]:
 
 
 def test_nobody_can_make_the_page_public(
-    server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     dug: list[object] = []
     monkeypatch.setattr("viser._viser.ViserTunnel", lambda *_: dug.append("a tunnel"))
@@ -54,7 +54,7 @@ def test_nobody_can_make_the_page_public(
     ids=lambda sent: repr(sent[:40]),
 )
 def test_a_malformed_message_harms_only_its_sender(
-    server: viser.ViserServer, sent: str | bytes, capfd: pytest.CaptureFixture, caplog: pytest.LogCaptureFixture
+    server: viser.ViserServer, sent: str | bytes, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     text = server.gui.add_markdown("before")
     with client(server) as other, client(server) as stranger:

@@ -85,7 +85,7 @@ def test_a_server_for_others_is_asked_by_an_address_or_by_its_own_name(host: str
 
 
 def test_a_server_for_others_says_so_once_on_stderr(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("viewer.server.is_loopback", lambda address: False)
     server = open_server(port=0)
@@ -104,7 +104,7 @@ def test_page_answers_on_this_machine_only(server: viser.ViserServer) -> None:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "127.0.0.2", "::1"])
-def test_the_address_that_is_told_opens_the_page(host: str, capsys: pytest.CaptureFixture) -> None:
+def test_the_address_that_is_told_opens_the_page(host: str, capsys: pytest.CaptureFixture[str]) -> None:
     try:
         server = open_server(host, 0)
     except ValueError:
@@ -193,7 +193,7 @@ def test_an_impossible_port_is_named(port: Any) -> None:
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="open files cannot be counted here")
-def test_nothing_is_left_of_closed_servers(capfd: pytest.CaptureFixture) -> None:
+def test_nothing_is_left_of_closed_servers(capfd: pytest.CaptureFixture[str]) -> None:
     """Neither threads nor sockets nor event loops; also where clients have called back, or do not answer."""
     close_server(open_server(port=0))  # what is imported late is no leak
     threads, files = set(threading.enumerate()), len(os.listdir("/proc/self/fd"))

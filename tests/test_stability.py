@@ -140,7 +140,7 @@ def test_a_reference_of_bfloat16_becomes_targets_of_32_bits() -> None:
 
 @pytest.mark.parametrize("kind", ["ball", "chain"])
 def test_random_scenes_neither_crash_nor_hide_what_is_not_finite(kind: str) -> None:
-    model = Simulator.of_physics(random_scenes.drawn(kind, None))
+    model = Simulator.of_physics(random_scenes.scene_of_kind(kind, None))
     found = random_scenes.random_scenes(kind, model, scenes=3, states_per_scene=4, steps=3, seed=0)
     assert (found.states, found.crashes, found.silent) == (12, [], 0)
 

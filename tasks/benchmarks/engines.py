@@ -334,7 +334,7 @@ def time_traced(question: Question, workload: Course) -> report.Row:
     def run(steps: int) -> float:
         nonlocal last
         begin = time.perf_counter()
-        last = jax.block_until_ready(ready.run(start, controls, jnp.int32(steps)))
+        last = jax.block_until_ready(ready.run(start, controls, jnp.int32(steps)))  # type: ignore[no-untyped-call]
         return time.perf_counter() - begin
 
     timing = timed(run, period if period < STEPS else 1, STEPS)
@@ -360,7 +360,7 @@ def time_gradient(question: Question, workload: Course) -> report.Row:
     def run(steps: int) -> float:
         nonlocal last
         begin = time.perf_counter()
-        last = jax.block_until_ready(ready.run(start, controls))
+        last = jax.block_until_ready(ready.run(start, controls))  # type: ignore[no-untyped-call]
         return time.perf_counter() - begin
 
     ready = compiled(cost, start, controls)
@@ -416,14 +416,14 @@ def answer(question: Question) -> report.Row:
     except ImportError as error:
         row["refused"] = f"is not installed ({error.name or error})"
     except Exception as error:  # an engine may fail in any way: its message is the result
-        row["refused"] = words(error)
+        row["refused"] = one_line(error)
     else:
         row["us_per_scene_step"] = 1e3 * row["ms_per_step"] / question.batch
         row |= {"peak_memory_mib": peak_memory(), "idle_memory_mib": idle}
     return row
 
 
-def words(error: Exception) -> str:
+def one_line(error: Exception) -> str:
     """Return an error's message in one line of less than 160 characters."""
     message = (str(error).strip() or type(error).__name__).splitlines()[0]
     return message if len(message) < 160 else f"{message[:157]}..."

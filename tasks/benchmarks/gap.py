@@ -125,7 +125,7 @@ def main(
     weights: Path | None = None,
     publish: bool = False,
 ) -> None:
-    """Compare model and truth on the planner's own candidates.
+    """Compare model and ground truth on the planner's own candidates.
 
     Args:
         targets: how many kicks are planned.

@@ -21,7 +21,7 @@ from tasks.kick import Kick
 from tasks.task import KNOTS, SEARCH
 
 # Central differences over the largest of these [m, rad, m/s, rad/s, along a random direction of unit normal numbers];
-# a state whose kink lies within it is tried again with the next.
+# a state whose kink lies within it is evaluated with the next.
 DIFFERENCES = (1e-7, 1e-8, 1e-9, 1e-10)
 AGREE = 0.01
 # Cost per spread; a kick costs some tens, so that a true slope beyond this predicts nothing one spread away.

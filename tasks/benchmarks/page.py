@@ -105,7 +105,7 @@ def watch(address: str, clients: int, visits: Synchronized[int]) -> None:
             visits.value += 1
 
 
-def until(condition: Callable[[], object], seconds: float = 120.0) -> float:
+def wait_until(condition: Callable[[], object], seconds: float = 120.0) -> float:
     """Wait until a condition is true and return the time that took [s].
 
     The condition is polled rarely, for polling takes time from the planner. Raises RuntimeError after `seconds`.
@@ -118,7 +118,7 @@ def until(condition: Callable[[], object], seconds: float = 120.0) -> float:
     return time.monotonic() - begin
 
 
-def of_kick(live: Live, ask: Callable[[], None]) -> report.Row:
+def kick_row(live: Live, ask: Callable[[], None]) -> report.Row:
     """Return planning times, miss and frame rate from first to last step [1/s] of a kick on the page."""
     page, before = live.page, live.run
     drawn = list[tuple[float, int]]()
@@ -129,7 +129,7 @@ def of_kick(live: Live, ask: Callable[[], None]) -> report.Row:
             drawn.append((time.monotonic(), page.frames))
         return live.run is not before and page.mode == "replay"
 
-    until(is_done)
+    wait_until(is_done)
     assert live.run is not None
     summary = live.run.summary
     return {
@@ -140,14 +140,14 @@ def of_kick(live: Live, ask: Callable[[], None]) -> report.Row:
     }
 
 
-def of_drag(live: Live, target: np.ndarray) -> report.Row:
+def drag_row(live: Live, target: np.ndarray) -> report.Row:
     """Drag the target and return the time until the new plan is drawn [s]."""
     page = live.page
     begin, plans = time.monotonic(), live.plans
     page.aim(target)
-    until(lambda: live.plans > plans)
+    wait_until(lambda: live.plans > plans)
     frames = page.frames
-    until(lambda: page.frames > frames + 1)
+    wait_until(lambda: page.frames > frames + 1)
     return {"drag_seconds": time.monotonic() - begin}
 
 
@@ -204,10 +204,10 @@ def measure(settings: PageSettings, json: Path) -> tuple[dict[str, report.Row], 
         live = Live(page, choices, USUAL, Path(folder), settings.seed)
         thread = threading.Thread(target=live.serve)
         thread.start()
-        until(lambda: page.mode == "planned", 300.0)
+        wait_until(lambda: page.mode == "planned", 300.0)
         watching, visits = watchers(page, settings.clients, process)
         for _ in range(WARM_UP):
-            of_kick(live, partial(page.ask, "kick"))
+            kick_row(live, partial(page.ask, "kick"))
         memory = process.memory_info().rss
         jobs = jobs_of(live, session, targets, settings)
         rows = dict(zip(jobs, report.collect(json, settings.command, jobs), strict=True))
@@ -235,7 +235,7 @@ def watchers(page: LivePage, clients: int, process: psutil.Process) -> tuple[Spa
     address = page.address.replace("http", "ws")
     watching = spawn.Process(target=watch, args=(address, clients, visits), daemon=True)
     watching.start()
-    until(lambda: len(process.net_connections("tcp")) > clients, 60.0)
+    wait_until(lambda: len(process.net_connections("tcp")) > clients, 60.0)
     return watching, visits
 
 
@@ -245,10 +245,10 @@ def jobs_of(
     """Return the jobs by name; watched and unwatched kicks alternate, for the machine may become slower."""
     jobs: dict[str, Callable[[], report.Row]] = {}
     for index, target in enumerate(targets):
-        jobs[f"drag {index}"] = partial(of_drag, live, target)
-        jobs[f"watched {index}"] = partial(of_kick, live, partial(live.page.ask, "kick"))
+        jobs[f"drag {index}"] = partial(drag_row, live, target)
+        jobs[f"watched {index}"] = partial(kick_row, live, partial(live.page.ask, "kick"))
         if index < settings.alone:
-            jobs[f"alone {index}"] = partial(headless, live, session, target, settings.preset, settings.seed)
+            jobs[f"alone {index}"] = partial(unwatched_row, live, session, target, settings.preset, settings.seed)
     return jobs
 
 
@@ -273,7 +273,7 @@ def table_of(figures: dict[str, Any], title: str) -> Table:
     return table
 
 
-def headless(live: Live, session: Session, target: np.ndarray, preset: PresetName, seed: int) -> report.Row:
+def unwatched_row(live: Live, session: Session, target: np.ndarray, preset: PresetName, seed: int) -> report.Row:
     """Return planning times of the same kick in real time without drawing.
 
     The pace is the same as on the page because planning after a pause is slower anyway.

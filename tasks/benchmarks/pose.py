@@ -49,8 +49,8 @@ MEASURES = {
     "plan_seconds": ("planning", "s a film"),
     "ms_per_candidate": ("planning", "ms a candidate"),
 }
-# The paper's own figures of AIST's videos, in the order of `TOLD`: DiffPhy's (E. Gartner et al. 2022), and what their
-# trajectory optimisation reaches in Bullet and in LARP.
+# The paper's own figures of AIST's videos, in the order of `MEASURES`: DiffPhy's (E. Gartner et al. 2022), and what
+# their trajectory optimisation reaches in Bullet and in LARP.
 PAPER: dict[str, tuple[float | None, ...]] = {
     "easy: DiffPhy": (150.0, 106.0, 66.0, 12.0, None, 19.6),
     "easy: Bullet": (154.0, 113.0, 69.0, 13.0, 0.41, 4.0),
@@ -138,7 +138,7 @@ class Film(NamedTuple):
 def filmed_points(clip: Path | None, seconds: float) -> np.ndarray:
     """Return points (T, P, 3) [m] of some seconds around a clip's strike, or of its middle where it is no kick.
 
-    clip: BVH or npz; the embedded kick, performed in the truth, by default.
+    clip: BVH or npz; the embedded kick, performed in the ground truth, by default.
     """
     if clip is None:
         reference, figure = embedded(human_and_ball()), figures.figure()
@@ -157,7 +157,7 @@ def filmed_points(clip: Path | None, seconds: float) -> np.ndarray:
     return points[first : first + count]
 
 
-def of_clip(clip: Path | None, camera: int, seconds: float, seed: int) -> Film:
+def film_of_clip(clip: Path | None, camera: int, seconds: float, seed: int) -> Film:
     """Return a film of some seconds of a clip, seen by a synthetic camera and detector."""
     true = filmed_points(clip, seconds)
     random = np.random.default_rng((seed, camera))
@@ -166,7 +166,7 @@ def of_clip(clip: Path | None, camera: int, seconds: float, seed: int) -> Film:
     return Film(name, synthetic_film.seen(random, lens, true, RATE), lens, true)
 
 
-def of_dance(folder: Path, sequence: str, camera: int, seconds: float) -> Film:
+def film_of_dance(folder: Path, sequence: str, camera: int, seconds: float) -> Film:
     """Return a film of the first seconds of a dance of AIST++, seen by one of its cameras."""
     name = dances.video(sequence, camera)
     keypoints, lens, true = dances.load(folder, sequence, camera)
@@ -193,7 +193,7 @@ def dances_of(folder: Path, names: Sequence[str], cameras: int, seconds: float) 
     films: dict[str, Callable[[], Film]] = {}
     for sequence, only in map(dances.seen_by, names):
         for camera in range(cameras) if only is None else (only,):
-            film = partial(of_dance, folder, sequence, camera, seconds)
+            film = partial(film_of_dance, folder, sequence, camera, seconds)
             film()
             films[dances.video(sequence, camera)] = film
     return films
@@ -207,7 +207,7 @@ def as_fast(preset: physical.FitPreset, share: float) -> physical.FitPreset:
     return preset._replace(steps=replace(steps, rounds=1, directions=directions))
 
 
-def measured(film: Callable[[], Film], ways: Sequence[Way], preset: physical.FitPreset, seed: int) -> dict[str, Any]:
+def row_of_film(film: Callable[[], Film], ways: Sequence[Way], preset: physical.FitPreset, seed: int) -> dict[str, Any]:
     """Reconstruct a film in each way and return its errors."""
     name, keypoints, lens, true = film()
     lifted = lift.lift(keypoints, lens)
@@ -298,7 +298,7 @@ def main(
     films = films_of(settings)
     report.ready(json, publish)
     prepare_jax()
-    jobs = {name: partial(measured, film, ways, physical.PRESETS[preset], seed) for name, film in films.items()}
+    jobs = {name: partial(row_of_film, film, ways, physical.PRESETS[preset], seed) for name, film in films.items()}
     rows = report.collect(json, settings.command, jobs)
     averages = {way: means(rows, way) for way in ways}
     content = {"command": settings.command, "hardware": report.hardware(), "means": averages, "rows": rows}
@@ -320,7 +320,7 @@ def films_of(settings: FilmSettings) -> dict[str, Callable[[], Film]]:
         return dances_of(settings.aist, settings.sequences, settings.cameras, settings.seconds)
     return {
         f"{'embedded' if clip is None else clip.stem}, camera {camera}": partial(
-            of_clip, clip, camera, settings.seconds, settings.seed
+            film_of_clip, clip, camera, settings.seconds, settings.seed
         )
         for clip in (settings.clips or (None,))
         for camera in range(settings.cameras)

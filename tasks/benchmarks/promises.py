@@ -43,12 +43,12 @@ def row(axis: str, value: Any, promise: str, observation: str, passed: bool) -> 
     return {"axis": axis, "value": str(value), "promise": promise, "seen": observation, "held": bool(passed)}
 
 
-def fastest(states: np.ndarray) -> float:
+def greatest_speed(states: np.ndarray) -> float:
     """Return the greatest speed along an axis [m/s] in states (*, L, 13)."""
     return float(np.abs(np.asarray(states, float)[..., packed.VELOCITY]).max(initial=0.0))
 
 
-def sound(states: np.ndarray) -> np.ndarray:
+def before_divergence(states: np.ndarray) -> np.ndarray:
     """Return the steps of a trajectory (H, L, 13) before it is flagged as diverged by a step of NaN alone."""
     flagged = np.isnan(states).all(axis=(1, 2))
     return states[: int(flagged.argmax()) if flagged.any() else len(states)]
@@ -56,12 +56,12 @@ def sound(states: np.ndarray) -> np.ndarray:
 
 def bounded(axis: str, value: Any, states: np.ndarray) -> Row:
     """Check that a trajectory (H, L, 13) stays finite, with bounded speeds and unit quaternions, until flagged."""
-    sound_states = np.asarray(sound(states), float)
-    speed = fastest(sound_states)
-    unit = float(np.abs(np.linalg.norm(sound_states[..., packed.ORIENTATION], axis=-1) - 1.0).max(initial=0.0))
-    passed = bool(np.isfinite(sound_states).all() and speed <= FASTEST and unit <= 1e-3)
+    valid_states = np.asarray(before_divergence(states), float)
+    speed = greatest_speed(valid_states)
+    unit = float(np.abs(np.linalg.norm(valid_states[..., packed.ORIENTATION], axis=-1) - 1.0).max(initial=0.0))
+    passed = bool(np.isfinite(valid_states).all() and speed <= FASTEST and unit <= 1e-3)
     promise = f"LARP: finite, quaternions of unit length, no link beyond {FASTEST:g} m/s, or flagged from there on"
-    until = f", flagged after {len(sound_states)} steps" if len(sound_states) < len(states) else ""
+    until = f", flagged after {len(valid_states)} steps" if len(valid_states) < len(states) else ""
     return row(axis, value, promise, f"fastest {speed:.3g} m/s, quaternions off by {unit:.0e}{until}", passed)
 
 

@@ -32,7 +32,7 @@ KINDS = (
 )
 
 
-def drawn(kind: str, random: np.random.Generator | None) -> Scene:
+def scene_of_kind(kind: str, random: np.random.Generator | None) -> Scene:
     """Return a scene of a kind with sizes from a tenth to ten times the usual, or the usual without a generator.
 
     A human's height [m] is between 0.3 and 3, and so are the factors of its segments' lengths and radii.
@@ -73,7 +73,7 @@ def drawn(kind: str, random: np.random.Generator | None) -> Scene:
     return Scene(chosen, (Pair(first.name, second.name, first_links, second_links, ball().surface),))
 
 
-def wild(scene: Scene, count: int, random: np.random.Generator) -> np.ndarray:
+def random_states(scene: Scene, count: int, random: np.random.Generator) -> np.ndarray:
     """Return states (count, L, 13) of random orientations, speeds to 50 m/s and angular velocities to 200 rad/s.
 
     Links may be below ground, and in some states all are in one place.
@@ -110,8 +110,8 @@ def random_scenes(kind: str, model: Simulator, scenes: int, states_per_scene: in
     slowest = 0.0
     starts, targets, pushes, shapes = [], [], [], []
     for _ in range(scenes):
-        scene = drawn(kind, random)
-        state = wild(scene, states_per_scene, random)
+        scene = scene_of_kind(kind, random)
+        state = random_states(scene, states_per_scene, random)
         lower, upper = scene.limits
         share = random.uniform(0.0, 1.0, (states_per_scene, steps, len(scene.motors), 3))
         control = 2.0 * (lower + share * (upper - lower))

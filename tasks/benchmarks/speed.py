@@ -121,7 +121,7 @@ def questions(scenes: Sequence[str], engines: Sequence[str], sizes: Sequence[int
             for size in sizes if engine not in ALONE else (1,):
                 yield Question(name, scene, reach, substeps, size, seed=seed)
     # Gradients compile for long, and planners use those of the learned simulator in their own scene: for all else,
-    # one batch suffices.
+    # one batch is enough.
     few = [size for size in sizes if size <= MIDDLE]
     for engine in (engine for engine in engines if engine in DIFFERENTIABLE):
         # Of the others, Brax supports no other scene and MJX fails in all of them.

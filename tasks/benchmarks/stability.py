@@ -300,7 +300,9 @@ def scene_jobs(bench: Bench, scenes: int, seed: int) -> dict[str, Callable[[], l
     """Return the jobs of random scenes by name, one of each kind; `scenes` are shared out evenly among the kinds."""
 
     def rows_of(kind: str) -> list[Row]:
-        model = bench.model if kind == "human and ball" else Simulator.of_physics(random_scenes.drawn(kind, None))
+        model = (
+            bench.model if kind == "human and ball" else Simulator.of_physics(random_scenes.scene_of_kind(kind, None))
+        )
         share = len(range(random_scenes.KINDS.index(kind), scenes, len(random_scenes.KINDS)))
         return random_scenes.scene_rows(kind, model, share, 20, seed)
 

@@ -13,7 +13,7 @@ from larp_model.engines.mujoco import Truth
 from larp_model.engines.mujoco import finite as truth_finite
 from larp_model.physics import kinematics
 from larp_model.physics.collision import CapsuleShapes, closest
-from tasks.benchmarks.promises import CLOSED, STEPS, Bench, bounded, flagged, in_double, refusal, row, sound
+from tasks.benchmarks.promises import CLOSED, STEPS, Bench, before_divergence, bounded, flagged, in_double, refusal, row
 from tasks.benchmarks.report import Row
 
 
@@ -102,7 +102,7 @@ def horizons(bench: Bench) -> list[Row]:
     apart = np.linalg.norm(np.asarray(kinematics.displacement(scene, jnp.asarray(states), morphology)), axis=-1)
     rows = []
     for steps in (100, 1_000, 5_000, length):
-        part = sound(states[:steps])
+        part = before_divergence(states[:steps])
         rows.append(bounded("horizon", f"{steps} steps", states[:steps]))
         opened = float(apart[: len(part)].max(initial=0.0))
         promise = f"LARP: joints stay closed within {100 * CLOSED:g} cm, or until flagged"

@@ -16,7 +16,7 @@ from larp_model import state as packed
 from larp_model.engines.mujoco import Truth
 from larp_model.physics import kinematics
 from larp_model.scene import Scene
-from tasks.benchmarks.promises import CLOSED, STEPS, Bench, bounded, flagged, row, sound
+from tasks.benchmarks.promises import CLOSED, STEPS, Bench, before_divergence, bounded, flagged, row
 from tasks.benchmarks.report import Row
 from tasks.kick import Kick
 
@@ -77,7 +77,9 @@ def sizes(bench: Bench, body: str, field: str) -> list[Row]:
             rows.append(bounded(f"{body} {field}", f"x {factor:g}", states[index]))
             rows.append(flagged(f"{body} {field}", f"x {factor:g}", true[0], bool(flags[0])))
             if body == "human":
-                opened = float(np.linalg.norm(apart[index][: len(sound(states[index]))], axis=-1).max(initial=0.0))
+                opened = float(
+                    np.linalg.norm(apart[index][: len(before_divergence(states[index]))], axis=-1).max(initial=0.0)
+                )
                 promise = f"LARP: joints stay closed within {100 * CLOSED:g} cm for {STEPS} steps, or until flagged"
                 observation = f"{100 * opened:.3g} cm"
                 rows.append(row(f"{body} {field}", f"x {factor:g}", promise, observation, opened <= CLOSED))
@@ -273,7 +275,7 @@ def wild_states(bench: Bench) -> list[Row]:
     for case, start, predicted, true_states, flag in zip(all_cases, states, learned, true, flags, strict=True):
         rows.append(bounded(case.axis, case.value, predicted))
         if case.law:
-            rows.append(row(case.axis, case.value, *case.law(start, sound(predicted))))
+            rows.append(row(case.axis, case.value, *case.law(start, before_divergence(predicted))))
         rows.append(flagged(case.axis, case.value, true_states, bool(flag)))
     return rows
 
