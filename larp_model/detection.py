@@ -1,4 +1,4 @@
-"""Contact detection in recorded states: whether and when links of two bodies touch within a step.
+"""Contact detection in recorded states: which links of two bodies touch within a step, and when.
 
 The simulator detects its own contacts: see `physics.collision`.
 """
@@ -47,28 +47,28 @@ def link_pairs(pair: Pair, first: Body, second: Body) -> tuple[np.ndarray, np.nd
     return np.array(rows)[:, 0], np.array(rows)[:, 1]
 
 
-def capsules(seen: Kinematics, rows: np.ndarray) -> CapsuleShapes:
-    """Return links by their rows (P,)."""
-    return CapsuleShapes(seen.position[rows], seen.half[rows], seen.sizes[rows, 1:2])
+def capsules(links: Kinematics, rows: np.ndarray) -> CapsuleShapes:
+    """Return the capsules of links in these rows (P,)."""
+    return CapsuleShapes(links.position[rows], links.half[rows], links.sizes[rows, 1:2])
 
 
 def detect(
-    pair: Pair, bodies: tuple[Body, Body], seen: tuple[Kinematics, Kinematics], after: tuple[Array, Array], dt: float
+    pair: Pair, bodies: tuple[Body, Body], links: tuple[Kinematics, Kinematics], after: tuple[Array, Array], dt: float
 ) -> ContactPoints:
-    """Return where the links of a pair of bodies touch within `dt` [s].
+    """Return the contact points of the links of a pair of bodies within `dt` [s].
 
-    seen: both when the step begins. after: states (n, 13, B) of both with the velocities at its end. Links move on,
+    links: both when the step begins. after: states (n, 13, B) of both with the velocities at its end. Links move on,
     evenly accelerated, until they touch (conservative advancement), so that a foot that crosses the ball within a step
     is detected.
     """
     rows = link_pairs(pair, *bodies)
-    first, second = (capsules(own, links) for own, links in zip(seen, rows, strict=True))
+    first, second = (capsules(own, link_rows) for own, link_rows in zip(links, rows, strict=True))
     (v1, w1), (v2, w2) = (
-        (own.velocity[links], own.angular_velocity[links]) for own, links in zip(seen, rows, strict=True)
+        (own.velocity[link_rows], own.angular_velocity[link_rows]) for own, link_rows in zip(links, rows, strict=True)
     )
     (v1_end, w1_end), (v2_end, w2_end) = (
-        (end[links, packed.VELOCITY], end[links, packed.ANGULAR_VELOCITY])
-        for end, links in zip(after, rows, strict=True)
+        (end[link_rows, packed.VELOCITY], end[link_rows, packed.ANGULAR_VELOCITY])
+        for end, link_rows in zip(after, rows, strict=True)
     )
     dv1, dw1, dv2, dw2 = v1_end - v1, w1_end - w1, v2_end - v2, w2_end - w2
 
@@ -76,42 +76,42 @@ def detect(
         share = time / dt
         one = advanced(first, v1 + 0.5 * share * dv1, w1 + 0.5 * share * dw1, time)
         two = advanced(second, v2 + 0.5 * share * dv2, w2 + 0.5 * share * dw2, time)
-        found = closest(one, two)
-        relative = v1 + share * dv1 + cross(w1 + share * dw1, found.point - one.centre)
-        relative -= v2 + share * dv2 + cross(w2 + share * dw2, found.point - two.centre)
-        return found, dot(relative, found.normal)
+        points = closest(one, two)
+        relative = v1 + share * dv1 + cross(w1 + share * dw1, points.point - one.centre)
+        relative -= v2 + share * dv2 + cross(w2 + share * dw2, points.point - two.centre)
+        return points, dot(relative, points.normal)
 
-    def advance(time: Array, nothing: None) -> tuple[Array, Array]:
-        found, approach = closest_at(time)
-        ahead = time_of_impact(found.distance, approach, dt - time)
-        # Links that sped up touched earlier than their first speeds told.
-        back = jnp.minimum(found.distance, 0.0) / jnp.where(approach > 1e-3, approach, jnp.inf)
-        return time + jnp.where(found.distance > 0.0, ahead, jnp.maximum(back, -time)), found.distance
+    def advance(time: Array, _: None) -> tuple[Array, Array]:
+        points, approach = closest_at(time)
+        ahead = time_of_impact(points.distance, approach, dt - time)
+        # Links that accelerated touched earlier than their first speeds imply.
+        back = jnp.minimum(points.distance, 0.0) / jnp.where(approach > 1e-3, approach, jnp.inf)
+        return time + jnp.where(points.distance > 0.0, ahead, jnp.maximum(back, -time)), points.distance
 
     # A scan, because an unrolled loop would be compiled as many times over.
     time, gaps = jax.lax.scan(advance, jnp.zeros_like(v1[:, :1]), length=ADVANCES)
-    found, _ = closest_at(time)
-    lowest = jnp.minimum(gaps[0], found.distance)
-    near, normal = smooth_gate(lowest, MARGIN), jnp.moveaxis(found.normal, -1, 0)
+    points, _ = closest_at(time)
+    lowest = jnp.minimum(gaps[0], points.distance)
+    near, normal = smooth_gate(lowest, MARGIN), jnp.moveaxis(points.normal, -1, 0)
     return ContactPoints(gaps[0, :, 0].T, lowest[:, 0].T, near[:, 0].T, (dt - time)[:, 0].T, normal)
 
 
 def contact_points(
     scene: Scene, state: Array, morphology: Array, after: Array | None = None
 ) -> list[tuple[Pair, ContactPoints]]:
-    """Return every pair of the scene and where its links touch, in states (B, L, 13), morphologies (B or 1, L, 3).
+    """Return every pair of the scene and its contact points, in states (B, L, 13), morphologies (B or 1, L, 3).
 
     after: states (B, L, 13) whose velocities are those at the end of the step; as they are by default.
     """
-    seen = kinematics(scene, jnp.moveaxis(state, 0, -1), jnp.moveaxis(morphology, 0, -1))
-    end = seen.state if after is None else jnp.moveaxis(after, 0, -1)
-    found = []
+    links = kinematics(scene, jnp.moveaxis(state, 0, -1), jnp.moveaxis(morphology, 0, -1))
+    end = links.state if after is None else jnp.moveaxis(after, 0, -1)
+    points_by_pair = []
     for pair in scene.pairs:
         first, second = scene.body(pair.first), scene.body(pair.second)
-        of_bodies = seen.of(scene, pair.first), seen.of(scene, pair.second)
+        of_bodies = links.of(scene, pair.first), links.of(scene, pair.second)
         ends = end[scene.rows(pair.first)], end[scene.rows(pair.second)]
-        found.append((pair, detect(pair, (first, second), of_bodies, ends, scene.dt)))
-    return found
+        points_by_pair.append((pair, detect(pair, (first, second), of_bodies, ends, scene.dt)))
+    return points_by_pair
 
 
 def first_contact(scene: Scene, states: Array, morphology: Array) -> Array:
@@ -124,18 +124,18 @@ def first_contact(scene: Scene, states: Array, morphology: Array) -> Array:
         return jnp.full(states.shape[0], -1)
     free = jnp.array([0.0, 0.0, -scene.gravity * scene.dt], states.dtype)
 
-    def hit(before: Array, after: Array) -> Array:
-        found = jnp.zeros(before.shape[0], bool)
+    def strikes(before: Array, after: Array) -> Array:
+        struck = jnp.zeros(before.shape[0], bool)
         for pair, points in contact_points(scene, before, morphology):
             _, second = link_pairs(pair, scene.body(pair.first), scene.body(pair.second))
             second = second + scene.rows(pair.second).start
             change = packed.velocity(after)[:, second] - packed.velocity(before)[:, second] - free
             pushed = jnp.sum(change**2, axis=-1) > PUSH**2
-            found |= jnp.any((points.near > 0.1) & pushed, axis=1)
-        return found
+            struck |= jnp.any((points.near > 0.1) & pushed, axis=1)
+        return struck
 
     def advance(carry: None, step: tuple[Array, Array]) -> tuple[None, Array]:
-        return carry, hit(*step)
+        return carry, strikes(*step)
 
     by_time = jnp.moveaxis(states, 1, 0)
     _, hits = jax.lax.scan(advance, None, (by_time[:-1], by_time[1:]))
@@ -146,8 +146,8 @@ def first_contacts(scene: Scene, episodes: Trajectories, chunk: int = 512) -> np
     """Return `first_contact` (E,) of many trajectories, chunk by chunk."""
     count = len(episodes.states)
     rows = np.minimum(np.arange(count + -count % chunk), count - 1).reshape(-1, chunk)
-    found = (_first_contact(scene, episodes.states[each], episodes.morphology[each]) for each in rows)
-    return np.concatenate(list(found))[:count]
+    steps = (_first_contact(scene, episodes.states[chunk_rows], episodes.morphology[chunk_rows]) for chunk_rows in rows)
+    return np.concatenate(list(steps))[:count]
 
 
 _first_contact = jax.jit(first_contact, static_argnums=0)

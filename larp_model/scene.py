@@ -185,7 +185,7 @@ class Body:
         return np.array([(link.length, link.radius, link.mass) for link in self.links])
 
     @property
-    def weighed(self) -> float:
+    def mass_length(self) -> float:
         """Return the mass [kg] of all links times their length [m], to which motors are in proportion."""
         return sum(link.mass for link in self.links) * sum(link.length for link in self.links)
 
@@ -198,7 +198,7 @@ class Body:
         larger = replace(self, links=links)
         if not self.motors:
             return larger
-        factor = larger.weighed / self.weighed
+        factor = larger.mass_length / self.mass_length
         joints = (
             joint if joint.motor is None else replace(joint, motor=joint.motor.times(factor)) for joint in self.joints
         )

@@ -164,4 +164,4 @@ def test_changes_say_all_of_a_motion(episodes: Episodes) -> None:
     )
     for one, other in zip(again, motion, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-12)
-    np.testing.assert_allclose(seen.position + again.moved, after[:, packed.POSITION], atol=1e-12)
+    np.testing.assert_allclose(seen.position + again.translation, after[:, packed.POSITION], atol=1e-12)

@@ -84,8 +84,8 @@ def compiled(body: Body) -> Any:
 
 def advanced(states: Array, motion: BodyMotion) -> Array:
     """States (N, n, 13) after a motion."""
-    turned = rotation.integrate(packed.orientation(states), motion.turned)
-    return packed.pack(packed.position(states) + motion.moved, turned, motion.velocity, motion.spin)
+    turned = rotation.integrate(packed.orientation(states), motion.rotation_vector)
+    return packed.pack(packed.position(states) + motion.translation, turned, motion.velocity, motion.angular_velocity)
 
 
 def moved(states: np.ndarray, motion: BodyMotion) -> np.ndarray:
@@ -164,7 +164,7 @@ def test_a_step_is_the_engines_but_for_a_share_of_its_change(body: Body, share: 
     truth.reset(states)
     true = truth.step(controls, torques)
     motion = compiled(body)(states, controls, torques)
-    for found, columns in ((motion.velocity, packed.VELOCITY), (motion.spin, packed.ANGULAR_VELOCITY)):
+    for found, columns in ((motion.velocity, packed.VELOCITY), (motion.angular_velocity, packed.ANGULAR_VELOCITY)):
         error = np.linalg.norm(found - true[..., columns], axis=-1)
         change = np.linalg.norm(true[..., columns] - states[..., columns], axis=-1)
         assert np.median(error) < share * np.median(change)

@@ -101,7 +101,7 @@ def test_slopes_of_impulses_are_their_derivatives_symmetric_and_not_negative(wan
 
 def test_all_contacts_obey_the_law_together(problem: contact.ContactProblem) -> None:
     impulses = impulses_of(problem, jnp.zeros_like(problem.velocity), 30)
-    called = problem.wanted_impulses(problem.after(impulses))
+    called = problem.impulses_at(problem.after(impulses))
     np.testing.assert_allclose(impulses, called, atol=1e-6)
     assert (jnp.abs(impulses).max(axis=1) > 0.01).any() and (impulses == 0.0).all(axis=1).any()
 
@@ -174,7 +174,7 @@ def test_impulses_are_answered_at_once_as_the_engines_inertia_says(body: Body, i
         expected = jacobians @ np.linalg.solve(inertia, np.einsum("lkv,lk->v", jacobians, push[index]))
         scale = np.abs(expected).max()
         np.testing.assert_allclose(found.velocity[index], expected[:, :3], atol=1e-5 * scale)
-        np.testing.assert_allclose(found.spin[index], expected[:, 3:], atol=1e-5 * scale)
+        np.testing.assert_allclose(found.angular_velocity[index], expected[:, 3:], atol=1e-5 * scale)
 
 
 @pytest.fixture(scope="module")

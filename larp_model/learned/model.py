@@ -14,7 +14,7 @@ from larp_model.scene import Body, Scene
 
 
 class Model(Protocol):
-    """Frozen and static under jit: all that weights depend on is a field of it, and so in their manifest."""
+    """A model of a scene, frozen and static under jit: all that weights depend on is a field, so in the manifest."""
 
     @property
     def scene(self) -> Scene:
@@ -22,11 +22,11 @@ class Model(Protocol):
 
     @property
     def invariant(self) -> bool:
-        """Return whether turning the world about z turns what the model does; else training has to teach it."""
+        """Return whether the model is equivariant under turns about z; else training augments its data."""
 
     @property
     def side_by_side(self) -> int:
-        """Return how many rollouts at a time take least, each, on a CPU."""
+        """Return the number of rollouts side by side at which one takes least time on a CPU."""
 
     def on(self, scene: Scene) -> Self:
         """Return the same model of a scene of bodies of the same kinds, or of some of them."""
@@ -40,7 +40,7 @@ class Model(Protocol):
         """Return states (B, L, 13) one `scene.dt` after states (B, L, 13).
 
         control (B, J, 3) joint targets [rad], torque (B, L, 3) [N m] from outside, world frame, morphology
-        (B or 1, L, 3). stop_gradient: for training, take derivatives as if what networks see did not depend on them.
+        (B or 1, L, 3). stop_gradient: for training, take derivatives as if the networks' inputs were constant.
         """
 
     def measure(self, before: Array, after: Array, control: Array, torque: Array, morphology: Array) -> Measured:
@@ -61,7 +61,7 @@ def initial_weights(model: Model, key: Array, statistics: Measured) -> Weights:
         size = statistics[name][0].mean.shape[0]
         networks[name] = module.init(jax.random.fold_in(key, index), jnp.zeros((1, size)))
     inputs = {name: statistics[name][0].floored for name in networks}
-    outputs = {name: found.floored for name in networks if (found := statistics[name][1]) is not None}
+    outputs = {name: changes.floored for name in networks if (changes := statistics[name][1]) is not None}
     return Weights(networks, inputs, outputs)
 
 
@@ -69,12 +69,12 @@ def blank_weights(model: Model) -> Weights:
     """Return the shapes and types of a model's weights."""
     scene = model.scene
 
-    def make() -> Weights:
+    def weights() -> Weights:
         state = jnp.zeros((1, len(scene.links), packed.SIZE))
         control, torque = jnp.zeros((1, len(scene.motors), 3)), jnp.zeros((1, len(scene.links), 3))
         sizes = jnp.zeros((1, len(scene.links), 3))
         return initial_weights(model, jax.random.key(0), model.measure(state, state, control, torque, sizes))
 
-    blank = jax.eval_shape(make)
+    blank = jax.eval_shape(weights)
     assert isinstance(blank, Weights)
     return blank

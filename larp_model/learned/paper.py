@@ -1,4 +1,4 @@
-"""f_d and f_c of the paper, to the letter: both see the world's axes, and what contact means is learned.
+"""f_d and f_c of the paper, to the letter: inputs in the world's axes, and contacts learned as well.
 
 M. Andriluka et al., "Learned neural physics simulation for articulated 3D human pose reconstruction" (2024).
 """
@@ -69,10 +69,10 @@ class PaperModel:
     def step(
         self, weights: Weights, state: Array, control: Array, torque: Array, morphology: Array, stop_gradient: bool
     ) -> Array:
-        """See `Model`: f_d of each body sees the sum of f_c over the contacts of its links (equation 1)."""
+        """See `Model`: an input of f_d of each body is the sum of f_c over the contacts of its links (equation 1)."""
         scene, networks = self.scene, self.networks()
-        seen = kinematics(scene, jnp.moveaxis(state, 0, -1), jnp.moveaxis(morphology, 0, -1))
-        by_body = {body.name: seen.of(scene, body.name) for body in scene.bodies}
+        links = kinematics(scene, jnp.moveaxis(state, 0, -1), jnp.moveaxis(morphology, 0, -1))
+        by_body = {body.name: links.of(scene, body.name) for body in scene.bodies}
         pushes = {
             body.name: jnp.zeros((*state[:, scene.rows(body.name)].shape[:2], 6), state.dtype) for body in scene.bodies
         }
@@ -80,8 +80,8 @@ class PaperModel:
             touching = by_body[pair.first], by_body[pair.second]
             name = network_name("contact", *both)
             features = contact_inputs(pair, both, jax.lax.stop_gradient(touching) if stop_gradient else touching)
-            for body, links, of_link in zip(both, detection.link_pairs(pair, *both), features, strict=True):
-                onto = jax.nn.one_hot(links, len(body.links), dtype=state.dtype)
+            for body, link_rows, of_link in zip(both, detection.link_pairs(pair, *both), features, strict=True):
+                onto = jax.nn.one_hot(link_rows, len(body.links), dtype=state.dtype)
                 push = jnp.einsum("bpf,pl->blf", evaluate(networks[name], weights, name, of_link), onto)
                 pushes[body.name] += push
         after = []
@@ -92,26 +92,26 @@ class PaperModel:
             inputs = side_by_side(body_inputs(body, own, control[:, motors], torque[:, rows]), *scaled)
             outputs = bounded(evaluate(networks[name], weights, name, inputs), self.bound)
             velocities = weights.outputs[name].restore(outputs).reshape(len(state), 2, len(body.links), 3)
-            velocity, spin = velocities[:, 0], velocities[:, 1]
+            velocity, angular_velocity = velocities[:, 0], velocities[:, 1]
             before = state[:, rows]
             position = packed.position(before) + scene.dt * velocity
-            turned = rotation.integrate(packed.orientation(before), scene.dt * spin)
-            after.append(packed.pack(position, turned, velocity, spin))
+            orientation = rotation.integrate(packed.orientation(before), scene.dt * angular_velocity)
+            after.append(packed.pack(position, orientation, velocity, angular_velocity))
         return jnp.concatenate(after, axis=1)
 
     def measure(self, before: Array, after: Array, control: Array, torque: Array, morphology: Array) -> Measured:
-        """See `Model`; of contacts where links are near, for elsewhere they count for nothing."""
+        """See `Model`; of contacts where links are near, as elsewhere their networks have no effect."""
         scene = self.scene
-        seen = kinematics(scene, jnp.moveaxis(before, 0, -1), jnp.moveaxis(morphology, 0, -1))
+        links = kinematics(scene, jnp.moveaxis(before, 0, -1), jnp.moveaxis(morphology, 0, -1))
         measured = Measured()
         for body in scene.bodies:
             rows, motors = scene.rows(body.name), scene.motor_rows(body.name)
-            inputs = body_inputs(body, seen.of(scene, body.name), control[:, motors], torque[:, rows])
+            inputs = body_inputs(body, links.of(scene, body.name), control[:, motors], torque[:, rows])
             velocities = packed.velocity(after[:, rows]), packed.angular_velocity(after[:, rows])
             outputs = Statistics.of(side_by_side(*velocities))
             measured[network_name("dynamics", body)] = Statistics.of(inputs).beside(6 * len(body.links)), outputs
         for pair, both in pairs_by_kind(scene):
-            own = seen.of(scene, pair.first), seen.of(scene, pair.second)
+            own = links.of(scene, pair.first), links.of(scene, pair.second)
             features = jnp.concatenate(contact_inputs(pair, both, own), axis=1)
             points = detection.detect(pair, both, own, (own[0].state, own[1].state), scene.dt)
             near = jnp.tile(points.near, (1, 2)).reshape(-1) + APART
@@ -128,40 +128,42 @@ def pairs_by_kind(scene: Scene) -> Iterator[tuple[Pair, tuple[Body, Body]]]:
         yield (pair, (first, second)) if first.kind <= second.kind else (pair.flipped(), (second, first))
 
 
-def body_inputs(body: Body, seen: Kinematics, control: Array, torque: Array) -> Array:
-    """Return what f_d sees (B, F), contacts apart; control (B, j, 3) [rad], torque (B, n, 3) [N m].
+def body_inputs(body: Body, links: Kinematics, control: Array, torque: Array) -> Array:
+    """Return the inputs of f_d (B, F), contacts apart; control (B, j, 3) [rad], torque (B, n, 3) [N m].
 
     Root-relative position, rotation matrix, velocities, displacement, torque; height, target quaternion, length and
     radius.
     """
     vectors = [
-        seen.position - seen.position[:1],
-        jnp.swapaxes(seen.matrices, 1, 2).reshape(-1, *seen.position.shape[1:]),
-        seen.velocity,
-        seen.angular_velocity,
-        seen.displacement,
+        links.position - links.position[:1],
+        jnp.swapaxes(links.matrices, 1, 2).reshape(-1, *links.position.shape[1:]),
+        links.velocity,
+        links.angular_velocity,
+        links.displacement,
     ]
-    before, height, sizes = (
-        jnp.moveaxis(each, -1, 0) for each in (jnp.concatenate(vectors), seen.position[:, 2], seen.sizes[:, :2])
+    features, height, sizes = (
+        jnp.moveaxis(array, -1, 0) for array in (jnp.concatenate(vectors), links.position[:, 2], links.sizes[:, :2])
     )
-    return side_by_side(before, torque, height, rotation.from_rotation_vector(control), sizes)
+    return side_by_side(features, torque, height, rotation.from_rotation_vector(control), sizes)
 
 
-def contact_inputs(pair: Pair, bodies: tuple[Body, Body], seen: tuple[Kinematics, Kinematics]) -> tuple[Array, Array]:
-    """Return what f_c sees (B, P, F) of the first link of each pair of links, and of the second: phi of both and c(.).
+def contact_inputs(pair: Pair, bodies: tuple[Body, Body], links: tuple[Kinematics, Kinematics]) -> tuple[Array, Array]:
+    """Return the inputs of f_c (B, P, F) for the first link of each pair of links, and for the second.
+
+    They are phi of both links and c(.).
 
     phi: position relative to the first body's root, quaternion, velocities, length, radius, mass. c(.): the contact
     point relative to the link, the normal and the distance, when the step begins.
     """
     rows = detection.link_pairs(pair, *bodies)
-    found = closest(*(detection.capsules(own, links) for own, links in zip(seen, rows, strict=True)))
-    root = seen[0].position[:1] * jnp.array([[1.0], [1.0], [0.0]], seen[0].state.dtype)
+    points = closest(*(detection.capsules(own, link_rows) for own, link_rows in zip(links, rows, strict=True)))
+    root = links[0].position[:1] * jnp.array([[1.0], [1.0], [0.0]], links[0].state.dtype)
 
-    def phi(own: Kinematics, links: np.ndarray) -> Array:
-        return jnp.concatenate([own.position - root, own.state[:, 3:], own.sizes], axis=1)[links]
+    def phi(own: Kinematics, link_rows: np.ndarray) -> Array:
+        return jnp.concatenate([own.position - root, own.state[:, 3:], own.sizes], axis=1)[link_rows]
 
-    first, second = (phi(*each) for each in zip(seen, rows, strict=True))
-    arms = [found.point - own.position[links] for own, links in zip(seen, rows, strict=True)]
-    by_first = jnp.concatenate([first, second, arms[0], found.normal, found.distance], axis=1)
-    by_second = jnp.concatenate([second, first, arms[1], -found.normal, found.distance], axis=1)
+    first, second = (phi(*side) for side in zip(links, rows, strict=True))
+    arms = [points.point - own.position[link_rows] for own, link_rows in zip(links, rows, strict=True)]
+    by_first = jnp.concatenate([first, second, arms[0], points.normal, points.distance], axis=1)
+    by_second = jnp.concatenate([second, first, arms[1], -points.normal, points.distance], axis=1)
     return jnp.moveaxis(by_first, -1, 0), jnp.moveaxis(by_second, -1, 0)

@@ -26,9 +26,9 @@ from larp_model.scene import Body, Scene
 class ResidualModel:
     """Physics, and what a network adds to the motion of each articulated body where no other body touches it.
 
-    A network sees and answers in the frame of the course of the root's axis. It sees how links are to the ground with
-    the velocities that physics gives them, and capsules by their axes alone. size: of the networks; None for none.
-    bound: what they may add, in standard deviations of what physics lacks.
+    Inputs and outputs of a network are in the frame of the course of the root's axis. Inputs are of the motion that
+    physics gives, also relative to the ground, and describe capsules by their axes alone. size: of the networks; None
+    for none. bound: of their outputs, in standard deviations of what physics lacks.
     """
 
     scene: Scene
@@ -38,7 +38,7 @@ class ResidualModel:
     bound: float = 10.0
 
     invariant = True
-    # Physics is made of many small loops.
+    # Physics consists of many small loops.
     side_by_side = 32
 
     def on(self, scene: Scene) -> ResidualModel:
@@ -55,26 +55,29 @@ class ResidualModel:
     def step(
         self, weights: Weights, state: Array, control: Array, torque: Array, morphology: Array, stop_gradient: bool
     ) -> Array:
-        """See `Model`; no contact has a network, so that there are no inputs to hold fixed."""
+        """See `Model`; contacts have no network, so that `stop_gradient` has no effect."""
 
-        def correct(body: Body, seen: Kinematics, motion: BodyMotion, dt: float) -> BodyMotion:
-            known = self.size is None or body.is_ball
-            return motion if known else self._corrected(body, weights, seen, motion, dt)
+        def correct(body: Body, links: Kinematics, motion: BodyMotion, dt: float) -> BodyMotion:
+            physics_alone = self.size is None or body.is_ball
+            return motion if physics_alone else self._corrected(body, weights, links, motion, dt)
 
         return physics_step(self.scene, state, control, torque, morphology, self.constants, self.contacts, correct)
 
-    def _corrected(self, body: Body, weights: Weights, seen: Kinematics, motion: BodyMotion, dt: float) -> BodyMotion:
+    def _corrected(self, body: Body, weights: Weights, links: Kinematics, motion: BodyMotion, dt: float) -> BodyMotion:
         """Return the motion (n, 3, B) within `dt` [s] as the network corrects it."""
         name = network_name("dynamics", body)
-        turn, inputs = network_inputs(body, seen, motion, dt)
+        turn, inputs = network_inputs(body, links, motion, dt)
         outputs = weights.outputs[name].restore(self.answer(weights, name, inputs))
         vectors = rotation.about_z(outputs.reshape(len(inputs), -1, 3), turn[:, None])
-        # Of a shorter step it is that share.
+        # Of a shorter step, the same share.
         added = dt / self.scene.dt * vectors.reshape(len(inputs), 4, -1, 3)
-        velocity, spin, moved, turned = (jnp.moveaxis(added[:, part], 0, -1) for part in range(4))
+        velocity, angular_velocity, translation, rotation_vector = (
+            jnp.moveaxis(added[:, part], 0, -1) for part in range(4)
+        )
         return BodyMotion(
-            motion.velocity + velocity, motion.spin + spin,
-            motion.moved + 0.5 * dt * velocity + moved, motion.turned + 0.5 * dt * spin + turned,
+            motion.velocity + velocity, motion.angular_velocity + angular_velocity,
+            motion.translation + 0.5 * dt * velocity + translation,
+            motion.rotation_vector + 0.5 * dt * angular_velocity + rotation_vector,
         )  # fmt: skip
 
     def measure(self, before: Array, after: Array, control: Array, torque: Array, morphology: Array) -> Measured:
@@ -90,61 +93,64 @@ class ResidualModel:
         From true steps (B, L, 13) -> (B, L, 13). Where links touch within a step, more is lacking than a network can
         know.
         """
-        scene, dt, found = self.scene, self.scene.dt, []
+        scene, dt, examples = self.scene, self.scene.dt, []
         state, end, targets, torques, sizes = (
-            jnp.moveaxis(each, 0, -1) for each in (before, after, control, torque, morphology)
+            jnp.moveaxis(array, 0, -1) for array in (before, after, control, torque, morphology)
         )
-        whole = kinematics(scene, state, sizes)
+        all_links = kinematics(scene, state, sizes)
         for body in scene.bodies if self.size else ():
             if body.is_ball:
                 continue
-            rows, seen, name = scene.rows(body.name), whole.of(scene, body.name), network_name("dynamics", body)
+            rows, links, name = scene.rows(body.name), all_links.of(scene, body.name), network_name("dynamics", body)
             motion, _ = articulated_motion(
-                body, seen, targets[scene.motor_rows(body.name)], torques[rows], scene.gravity, dt, self.constants
+                body, links, targets[scene.motor_rows(body.name)], torques[rows], scene.gravity, dt, self.constants
             )
-            turn, inputs = network_inputs(body, seen, motion, dt)
-            lacking = changes(seen, true_motion(seen, end[rows]), dt) - changes(seen, motion, dt)
+            turn, inputs = network_inputs(body, links, motion, dt)
+            lacking = changes(links, true_motion(links, end[rows]), dt) - changes(links, motion, dt)
             vectors = jnp.moveaxis(lacking, -1, 0).reshape(len(after), -1, 3)
             outputs = rotation.about_z(vectors, rotation.opposite(turn)[:, None])
-            found.append((name, inputs, outputs.reshape(len(after), -1)))
-        return found
+            examples.append((name, inputs, outputs.reshape(len(after), -1)))
+        return examples
 
     def answer(self, weights: Weights, name: str, inputs: Array) -> Array:
         """Return what a network adds (B, O), for inputs (B, F), in standard deviations of what physics lacks."""
         return bounded(evaluate(self.networks()[name], weights, name, inputs), self.bound)
 
 
-def network_inputs(body: Body, seen: Kinematics, motion: BodyMotion, dt: float) -> tuple[Array, Array]:
+def network_inputs(body: Body, links: Kinematics, motion: BodyMotion, dt: float) -> tuple[Array, Array]:
     """Return the frame of a body's network, cosine and sine (B, 2), and its inputs (B, F)."""
-    turn = rotation.course(seen.orientation[0].T, body.links[0].axis)
-    axes = jnp.array([link.axis for link in body.links], seen.state.dtype)[..., None]
-    velocities, ends = ends_on_ground(seen, motion.velocity, motion.spin, dt)
+    turn = rotation.course(links.orientation[0].T, body.links[0].axis)
+    axes = jnp.array([link.axis for link in body.links], links.state.dtype)[..., None]
+    velocities, ends = ends_on_ground(links, motion.velocity, motion.angular_velocity, dt)
     vectors = [
-        seen.position - seen.position[:1], mv(seen.matrices, axes), motion.velocity, motion.spin, seen.displacement,
-        velocities,
+        links.position - links.position[:1], mv(links.matrices, axes), motion.velocity, motion.angular_velocity,
+        links.displacement, velocities,
     ]  # fmt: skip
-    turned = rotation.about_z(jnp.moveaxis(jnp.concatenate(vectors), -1, 0), rotation.opposite(turn)[:, None])
-    rest = seen.position[:, 2], seen.sizes, ends
-    return turn, side_by_side(turned, *(jnp.moveaxis(each, -1, 0) for each in rest))
+    rotated = rotation.about_z(jnp.moveaxis(jnp.concatenate(vectors), -1, 0), rotation.opposite(turn)[:, None])
+    rest = links.position[:, 2], links.sizes, ends
+    return turn, side_by_side(rotated, *(jnp.moveaxis(array, -1, 0) for array in rest))
 
 
-def true_motion(seen: Kinematics, after: Array) -> BodyMotion:
-    """Return the motion (n, 3, B) that leads from the states that are seen to others (n, 13, B)."""
-    before, after = (jnp.moveaxis(each, -1, 0) for each in (seen.state, after))
+def true_motion(links: Kinematics, after: Array) -> BodyMotion:
+    """Return the motion (n, 3, B) from the states of links to states (n, 13, B) afterwards."""
+    before, after = (jnp.moveaxis(array, -1, 0) for array in (links.state, after))
     relative = rotation.multiply(packed.orientation(after), rotation.conjugate(packed.orientation(before)))
     motion = BodyMotion(
         packed.velocity(after), packed.angular_velocity(after),
         packed.position(after) - packed.position(before), rotation.to_rotation_vector(relative),
     )  # fmt: skip
-    return BodyMotion(*(jnp.moveaxis(each, 0, -1) for each in motion))
+    return BodyMotion(*(jnp.moveaxis(array, 0, -1) for array in motion))
 
 
-def changes(seen: Kinematics, motion: BodyMotion, dt: float) -> Array:
-    """Return a motion as changes (4, n, 3, B), what networks add to.
+def changes(links: Kinematics, motion: BodyMotion, dt: float) -> Array:
+    """Return a motion as changes (4, n, 3, B), to which networks add.
 
-    Of velocity [m/s] and spin [rad/s], and corrections [m, rad] of the trapezoidal step x' = x + (v + v') dt / 2.
+    Of velocity [m/s] and angular velocity [rad/s], and corrections [m, rad] of the trapezoidal step
+    x' = x + (v + v') dt / 2.
     """
-    velocity, spin = seen.velocity, seen.angular_velocity
-    moved = motion.moved - 0.5 * dt * (velocity + motion.velocity)
-    turned = motion.turned - 0.5 * dt * (spin + motion.spin)
-    return jnp.stack([motion.velocity - velocity, motion.spin - spin, moved, turned])
+    velocity, angular_velocity = links.velocity, links.angular_velocity
+    translation = motion.translation - 0.5 * dt * (velocity + motion.velocity)
+    rotation_vector = motion.rotation_vector - 0.5 * dt * (angular_velocity + motion.angular_velocity)
+    return jnp.stack(
+        [motion.velocity - velocity, motion.angular_velocity - angular_velocity, translation, rotation_vector]
+    )

@@ -62,12 +62,12 @@ def closest(first: CapsuleShapes, second: CapsuleShapes) -> ClosestPoints:
     t = jnp.clip((ab * s + bc) / bb, -1.0, 1.0)
     s = jnp.where(parallel & (jnp.abs(t) < 1.0), s, jnp.clip((ab * t - ac) / aa, -1.0, 1.0))
     on_first, on_second = first.centre + s * first.half, second.centre + t * second.half
-    apart = on_second - on_first
-    squared = dot(apart, apart)
+    offset = on_second - on_first
+    squared = dot(offset, offset)
     zero = squared < 1e-20
     length = jnp.sqrt(jnp.where(zero, 1.0, squared))
-    up = jnp.array([0.0, 0.0, 1.0], apart.dtype)[:, None]
-    normal = jnp.where(zero, up, apart / length)
+    up = jnp.array([0.0, 0.0, 1.0], offset.dtype)[:, None]
+    normal = jnp.where(zero, up, offset / length)
     distance = jnp.where(zero, 0.0, length) - first.radius - second.radius
     point = 0.5 * (on_first + first.radius * normal + on_second - second.radius * normal)
     return ClosestPoints(normal, distance, point, jnp.concatenate([s, t], axis=1))
@@ -86,7 +86,7 @@ def advanced(capsules: CapsuleShapes, velocity: Array, angular_velocity: Array, 
 def time_of_impact(distance: Array, approach: Array, limit: Array | float) -> Array:
     """Return times (*,) [s] until gaps `distance` close at speeds `approach`, within [0, limit]; else `limit`.
 
-    It jumps where bodies that part touch at just no distance: there alone no gradient is that of the differences.
+    It jumps where bodies that separate are at zero distance: there alone its gradient is not that of differences.
     """
     closing = approach > 1e-3
     time = jnp.maximum(distance, 0.0) / jnp.where(closing, approach, 1.0)
@@ -103,9 +103,9 @@ def smooth_gate(gap: Array, margin: float) -> Array:
 class ContactSettings:
     """Settings of the contact solver and of its integration in time.
 
-    contacts: how many pairs of links, the nearest, are looked at. substeps: of a step. iterations: of Newton's method.
-    fade: time [s] within which servos take back what links have gained, see `response`. margin: links touch within a
-    step where their gap falls below this [m]. moments: so often in a step their gap is looked at.
+    contacts: number of pairs of links, the nearest, that are solved for. substeps: of a step. iterations: of Newton's
+    method. fade: relaxation time [s] of transient velocities, see `response`. margin: links touch within a step where
+    their gap falls below this [m]. moments: number of times within a step at which gaps are computed.
     """
 
     contacts: int = 2
@@ -120,15 +120,16 @@ class Rates(NamedTuple):
     """Accelerations of the links of a scene in a step in which no other link touches them, (L, 3, B) each.
 
     acceleration [m/s^2], angular_acceleration [rad/s^2]: mean ones, which change by jerk, angular_jerk [m/s^3,
-    rad/s^3]. uncounted, uncounted_angular: parts of them that contacts do not count, see `motion.velocity_products`.
+    rad/s^3]. velocity_product, angular_velocity_product: parts of them that contacts do not count, see
+    `motion.velocity_products`.
     """
 
     acceleration: Array
     angular_acceleration: Array
     jerk: Array
     angular_jerk: Array
-    uncounted: Array
-    uncounted_angular: Array
+    velocity_product: Array
+    angular_velocity_product: Array
 
 
 @dataclass(frozen=True)
@@ -160,46 +161,50 @@ class Candidates:
         """Return the names of the balls."""
         return tuple(body.name for body in self.scene.bodies if body.is_ball)
 
-    def gaps(self, seen: Kinematics, rates: Rates, dt: float, settings: ContactSettings) -> Array:
-        """Return the smallest gap (P, B) [m] of every pair of links within `dt` [s], as they accelerate on average."""
+    def gaps(self, links: Kinematics, rates: Rates, dt: float, settings: ContactSettings) -> Array:
+        """Return the smallest gap (P, B) [m] of every pair of links within `dt` [s], at their mean accelerations."""
         first, second = self.rows
 
         def at(time: Array) -> Array:
-            position = seen.position + time * (seen.velocity + 0.5 * time * rates.acceleration)
-            half = turned(seen.half, time * (seen.angular_velocity + 0.5 * time * rates.angular_acceleration))
-            one, two = (CapsuleShapes(position[rows], half[rows], seen.sizes[rows, 1:2]) for rows in (first, second))
+            position = links.position + time * (links.velocity + 0.5 * time * rates.acceleration)
+            half = turned(links.half, time * (links.angular_velocity + 0.5 * time * rates.angular_acceleration))
+            one, two = (CapsuleShapes(position[rows], half[rows], links.sizes[rows, 1:2]) for rows in (first, second))
             return closest(one, two).distance[:, 0]
 
-        times = jnp.linspace(0.0, dt, settings.moments, dtype=seen.state.dtype)
+        times = jnp.linspace(0.0, dt, settings.moments, dtype=links.state.dtype)
         return jnp.min(jax.lax.map(at, times), axis=0)
 
 
 class Sides(NamedTuple):
-    """The S links of K contacts and nb balls on the ground: K first links, K second links, the balls.
+    """The S sides of contacts, a link each: of K pairs of links the K first and the K second ones, then the balls.
 
-    which: (S, L, B) one-hot. owners: names of the bodies that each can be of.
+    one_hot: (S, L, B), the link of each side. owners: names of the bodies that it can belong to.
     """
 
-    which: Array
+    one_hot: Array
     owners: tuple[frozenset[str], ...]
 
     def of(self, values: Array) -> Array:
-        """Return the sides' values (S, ..., B), out of those of all links (L, ..., B)."""
-        return picked(self.which, values)
+        """Return the values (S, ..., B) of the sides, from those of all links (L, ..., B)."""
+        return select(self.one_hot, values)
 
 
-def sides_of(candidates: Candidates, chosen: Array) -> Sides:
-    """Return the sides of the pairs of links chosen by one-hot rows (K, P, B), and of all balls."""
+def sides_of(candidates: Candidates, selection: Array) -> Sides:
+    """Return the sides of K pairs of links, selected by one-hot rows (K, P, B), and of all balls."""
     scene, (first, second) = candidates.scene, candidates.rows
-    every = np.eye(len(scene.links))
-    of_links = [picked(chosen, jnp.asarray(every[rows], chosen.dtype)[..., None]) for rows in (first, second)]
-    batch = chosen.shape[-1]
+    identity = np.eye(len(scene.links))
+    of_links = [select(selection, jnp.asarray(identity[rows], selection.dtype)[..., None]) for rows in (first, second)]
+    batch = selection.shape[-1]
     of_balls = [
-        jnp.broadcast_to(jnp.asarray(every[scene.rows(name)], chosen.dtype)[..., None], (1, len(every), batch))
+        jnp.broadcast_to(jnp.asarray(identity[scene.rows(name)], selection.dtype)[..., None], (1, len(identity), batch))
         for name in candidates.balls
     ]
     firsts, seconds = (frozenset(getattr(pair, end) for pair in scene.pairs) for end in ("first", "second"))
-    owners = (*[firsts] * len(chosen), *[seconds] * len(chosen), *(frozenset([name]) for name in candidates.balls))
+    owners = (
+        *[firsts] * len(selection),
+        *[seconds] * len(selection),
+        *(frozenset([name]) for name in candidates.balls),
+    )
     return Sides(jnp.concatenate([*of_links, *of_balls]), owners)
 
 
@@ -209,9 +214,9 @@ def turned(vector: Array, by: Array) -> Array:
     return vector + once + 0.5 * cross(by, once)
 
 
-def picked(which: Array, values: Array) -> Array:
-    """Return (S, ..., B) what one-hot rows (S, L, B) take of values (L, ..., B or 1)."""
-    rows = which.reshape(*which.shape[:2], *[1] * (values.ndim - 2), which.shape[-1])
+def select(one_hot: Array, values: Array) -> Array:
+    """Return the values (S, ..., B) that one-hot rows (S, L, B) select from (L, ..., B or 1)."""
+    rows = one_hot.reshape(*one_hot.shape[:2], *[1] * (values.ndim - 2), one_hot.shape[-1])
     total = rows[:, 0] * values[0]
     for row in range(1, len(values)):
         total += rows[:, row] * values[row]

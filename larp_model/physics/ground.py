@@ -1,9 +1,9 @@
 """The ground under an articulated body: contacts of both ends of all its links, solved together with its motion.
 
 MuJoCo's soft contact: the impulse J on an end whose velocity is v' is the projection of m (v - v') onto the friction
-cone, with the mass m that holds the end and the velocity v that the ground allows (see `physics.contact`). Where J is
-taken as linear around a guess, it adds to the inertia and to the momentum of the link, and one pass of
-`articulated.solve` yields all velocities: a step of Newton's method.
+cone, with the regularisation mass m and the target velocity v of the contact (see `physics.contact`). Where J is taken
+as linear around a guess, it adds to the inertia and to the momentum of the link, and one pass of `articulated.solve`
+gives all velocities: a step of Newton's method.
 
 Arrays have the batch last, as in `linalg`: n links, 2 n ends.
 """
@@ -23,118 +23,126 @@ from larp_model.physics.contact import projection
 from larp_model.physics.kinematics import Anchors
 from larp_model.scene import Body
 
-# Newton's method ends where no impulse is further off, as a share of the body's largest and in units of the precision:
-# 1e-3 in 32 bits.
+# Newton's method ends where no impulse has a larger error, as a share of the body's largest and in units of the
+# precision: 1e-3 in 32 bits.
 TOLERANCE = 1e4
 
 
 class Ends(NamedTuple):
-    """Both ends of all links, (2 n, ..., B), one end of each after the other, and the velocity that the ground allows.
+    """Both ends of all links, (2 n, ..., B), one end of each after the other, and their target velocity.
 
-    arm: their lowest points [m] from the links' centres. clearance: their height [m]. allowed: the velocity [m/s] at
-    which neither the spring of the body's surface nor friction pushes them.
+    arm: their lowest points [m] from the links' centres. clearance: their height [m]. target_velocity: that [m/s] at
+    which neither the spring of the body's surface nor friction acts on them.
     """
 
     arm: Array
     clearance: Array
-    allowed: Array
+    target_velocity: Array
 
     @staticmethod
     def of(
-        body: Body, matrices: Array, height: Array, velocity: Array, spin: Array, sizes: Array, h: float,
-        gains: tuple[Array, Array],
+        body: Body, matrices: Array, height: Array, velocity: Array, angular_velocity: Array, sizes: Array, h: float,
+        accelerations: tuple[Array, Array],
     ) -> Ends:  # fmt: skip
         """Return the ends of links by rotations (n, 3, 3, B), heights (n, 1, B) [m] and first velocities (n, 3, B).
 
-        gains: accelerations of the links, (n, 3, B) [m/s^2] and [rad/s^2], that contacts do not count.
+        accelerations: those of the links, (n, 3, B) [m/s^2] and [rad/s^2], that contacts do not count.
         """
         surface, upright = body.surface, _upright(matrices)
         axes = jnp.array([link.axis for link in body.links], matrices.dtype)[..., None]
         half, down = 0.5 * sizes[:, :1] * mv(matrices, axes), sizes[:, 1:2] * upright
         arm = jnp.concatenate([half - down, -half - down])
-        speed, clearance = twice(velocity) + cross(twice(spin), arm), twice(height) + arm[:, 2:]
-        speed += h * (twice(gains[0]) + cross(twice(gains[1]), arm))
+        speed, clearance = twice(velocity) + cross(twice(angular_velocity), arm), twice(height) + arm[:, 2:]
+        speed += h * (twice(accelerations[0]) + cross(twice(accelerations[1]), arm))
         damped = 1.0 + h * surface.damping
         rising = (speed[:, 2:] - h * surface.stiffness * clearance) / (damped + h**2 * surface.stiffness)
         return Ends(arm, clearance, speed * (1.0 - upright) / damped + rising * upright)
 
-    def velocity(self, velocity: Array, spin: Array) -> Array:
+    def velocity(self, velocity: Array, angular_velocity: Array) -> Array:
         """Return the ends' velocities (2 n, 3, B), from those of the links."""
-        return twice(velocity) + cross(twice(spin), self.arm)
+        return twice(velocity) + cross(twice(angular_velocity), self.arm)
 
     def at_links(self, masses: Array, momenta: Array) -> tuple[Inertia, Momenta]:
-        """Return what masses (2 n, 3, 3, B) [kg] and momenta (2 n, 3, B) at the ends are to their links."""
+        """Return inertia and momenta of links, from masses (2 n, 3, 3, B) [kg] and momenta (2 n, 3, B) at the ends."""
         mixed, links = cross_columns(self.arm, masses), len(self.arm) // 2
         added = Inertia(-cross_rows(mixed, self.arm), mixed, masses), Momenta(cross(self.arm, momenta), momenta)
-        both: tuple[Inertia, Momenta] = jax.tree.map(lambda ends: ends[:links] + ends[links:], added)
-        return both
+        totals: tuple[Inertia, Momenta] = jax.tree.map(lambda ends: ends[:links] + ends[links:], added)
+        return totals
 
 
 class GroundMotion(NamedTuple):
     """Velocities [m/s] and angular velocities [rad/s] of links (n, 3, B) under the ground's impulses.
 
-    active (2 n, 1, B): 1 where an end is in the ground, else 0. impulses (2 n, 3, B) [N s] that these velocities call
-    for. slopes (2 n, 3, 3, B) [kg]: how impulses fall with the ends' velocities.
+    active (2 n, 1, B): active set, 1 where an end is in the ground, else 0. impulses (2 n, 3, B) [N s]: projections at
+    these velocities. slopes (2 n, 3, 3, B) [kg]: their negative derivatives by the ends' velocities.
     """
 
     velocity: Array
-    spin: Array
+    angular_velocity: Array
     active: Array
     impulses: Array
     slopes: Array
 
 
 class GroundProblem(NamedTuple):
-    """Links of a body within `h` [s]: what they have without the ground, their joints, and their ends.
+    """Links of a body within `h` [s]: inertia and momenta without the ground, their joints, and their ends.
 
-    anchors, closing, pull, hold: of the joints, see `Level`. mass (1, 1, B) [kg]: that holds an end, the module's m.
+    anchors, closing, impulse, resistance: of the joints, see `Level`. mass (1, 1, B) [kg]: the module's m.
     """
 
     inertia: Inertia
-    push: Momenta
+    momenta: Momenta
     anchors: Anchors
     closing: Array
-    pull: Array
-    hold: Array
+    impulse: Array
+    resistance: Array
     ends: Ends
     mass: Array
     h: Array | float
 
-    def at(self, body: Body, velocity: Array, spin: Array, active: Array) -> GroundMotion:
-        """Return what velocities (n, 3, B) call for; ends that were `active` before stay so."""
-        of_ends = self.ends.velocity(velocity, spin)
-        active = jnp.maximum(active, ramp(-self.ends.clearance - self.h * of_ends[:, 2:], 1e-5))
-        up = jnp.broadcast_to(_upright(of_ends), of_ends.shape)
-        impulses, slopes = projection(self.mass * (self.ends.allowed - of_ends), up, body.surface.friction)
+    def at(self, body: Body, velocity: Array, angular_velocity: Array, active: Array) -> GroundMotion:
+        """Return the motion of velocities (n, 3, B) with its impulses; ends that were `active` before stay so."""
+        end_velocities = self.ends.velocity(velocity, angular_velocity)
+        active = jnp.maximum(active, ramp(-self.ends.clearance - self.h * end_velocities[:, 2:], 1e-5))
+        up = jnp.broadcast_to(_upright(end_velocities), end_velocities.shape)
+        impulses, slopes = projection(
+            self.mass * (self.ends.target_velocity - end_velocities), up, body.surface.friction
+        )
         return GroundMotion(
-            velocity, spin, active, active * impulses, barrier(active[:, None] * self.mass[:, None] * slopes)
+            velocity,
+            angular_velocity,
+            active,
+            active * impulses,
+            barrier(active[:, None] * self.mass[:, None] * slopes),
         )
 
     def linear(self, guess: GroundMotion) -> tuple[Inertia, Momenta]:
-        """Return what impulses that are linear around a guess add to the links' inertia and momentum."""
-        of_ends = self.ends.velocity(guess.velocity, guess.spin)
-        return self.ends.at_links(guess.slopes, guess.impulses + mv(guess.slopes, of_ends))
+        """Return inertia and momenta that impulses, linear around a guess, add to those of the links."""
+        end_velocities = self.ends.velocity(guess.velocity, guess.angular_velocity)
+        return self.ends.at_links(guess.slopes, guess.impulses + mv(guess.slopes, end_velocities))
 
     def newton(self, body: Body, guess: GroundMotion) -> GroundMotion:
         """Return the motion under impulses that are linear around a guess."""
-        levels = levels_of(body, self.anchors, self.closing, self.pull, self.hold)
-        inertia, push = barrier(jax.tree.map(jnp.add, (self.inertia, self.push), self.linear(guess)))
-        return self.at(body, *solve(inertia, push, levels), guess.active)
+        levels = levels_of(body, self.anchors, self.closing, self.impulse, self.resistance)
+        inertia, momenta = barrier(jax.tree.map(jnp.add, (self.inertia, self.momenta), self.linear(guess)))
+        return self.at(body, *solve(inertia, momenta, levels), guess.active)
 
     def converged(self, before: GroundMotion, after: GroundMotion) -> Array:
         """Return (B,) where the impulses are those that were linear around the motion before, or are not finite."""
-        change = self.ends.velocity(after.velocity - before.velocity, after.spin - before.spin)
+        change = self.ends.velocity(after.velocity - before.velocity, after.angular_velocity - before.angular_velocity)
         error = after.impulses - before.impulses + mv(before.slopes, change)
-        size, largest = (jnp.max(jnp.abs(each), axis=(0, 1)) for each in (error, after.impulses))
-        return ~(size > TOLERANCE * jnp.finfo(largest.dtype).eps * largest)
+        residual, largest = (jnp.max(jnp.abs(values), axis=(0, 1)) for values in (error, after.impulses))
+        return ~(residual > TOLERANCE * jnp.finfo(largest.dtype).eps * largest)
 
 
-def motion_on_ground(body: Body, iterations: int, problem: GroundProblem, velocity: Array, spin: Array) -> GroundMotion:
-    """Return how a body moves on the ground, from a guess of its velocities (n, 3, B).
+def motion_on_ground(
+    body: Body, iterations: int, problem: GroundProblem, velocity: Array, angular_velocity: Array
+) -> GroundMotion:
+    """Return the motion of a body on the ground, from a guess of its velocities (n, 3, B).
 
     iterations: of Newton's method, at most; a body's motion is final once it has converged, whatever others need.
     """
-    guess = problem.at(body, velocity, spin, jnp.zeros_like(problem.ends.clearance))
+    guess = problem.at(body, velocity, angular_velocity, jnp.zeros_like(problem.ends.clearance))
     return _solution(body, iterations, problem, jax.lax.stop_gradient(guess))
 
 
@@ -144,18 +152,18 @@ NewtonCarry = tuple[Array, Array, GroundMotion]
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _solution(body: Body, iterations: int, problem: GroundProblem, guess: GroundMotion) -> GroundMotion:
-    def goes_on(carry: NewtonCarry) -> Array:
-        number, unfinished, _ = carry
-        return (number < iterations) & jnp.any(unfinished)
+    def continues(carry: NewtonCarry) -> Array:
+        number, unconverged, _ = carry
+        return (number < iterations) & jnp.any(unconverged)
 
     def newton(carry: NewtonCarry) -> NewtonCarry:
-        number, unfinished, before = carry
+        number, unconverged, before = carry
         after = problem.newton(body, before)
-        chosen = jax.tree.map(partial(jnp.where, unfinished), after, before)
-        return number + 1, unfinished & ~problem.converged(before, after), chosen
+        updated = jax.tree.map(partial(jnp.where, unconverged), after, before)
+        return number + 1, unconverged & ~problem.converged(before, after), updated
 
-    every = jnp.ones(guess.velocity.shape[-1], bool)
-    return jax.lax.while_loop(goes_on, newton, (jnp.array(0), every, guess))[2]
+    unconverged = jnp.ones(guess.velocity.shape[-1], bool)
+    return jax.lax.while_loop(continues, newton, (jnp.array(0), unconverged, guess))[2]
 
 
 @_solution.defjvp
@@ -163,13 +171,13 @@ def _solution_jvp(
     body: Body, iterations: int, primals: tuple[GroundProblem, GroundMotion],
     tangents: tuple[GroundProblem, GroundMotion],
 ) -> tuple[GroundMotion, GroundMotion]:  # fmt: skip
-    """Differentiate one more step from the solution, where it does not depend on what it started from."""
+    """Differentiate one more step from the solution, where it does not depend on its guess."""
     problem, guess = primals
     solution = jax.lax.stop_gradient(_solution(body, iterations, problem, guess))
 
     def step(problem: GroundProblem) -> GroundMotion:
-        same = problem.at(body, solution.velocity, solution.spin, solution.active)
-        return problem.newton(body, same)
+        at_solution = problem.at(body, solution.velocity, solution.angular_velocity, solution.active)
+        return problem.newton(body, at_solution)
 
     return solution, jax.jvp(step, (problem,), tangents[:1])[1]
 
@@ -177,8 +185,8 @@ def _solution_jvp(
 def ramp(value: Array, width: float) -> Array:
     """Return 0 where a value is negative, 1 from `width` on, and no slope between.
 
-    A compiler works a comparison out anew beside every block of a matrix, and may round otherwise: blocks that are not
-    of one mind make no matrix that is positive. A ramp differs as little as its argument.
+    A compiler evaluates a comparison again for every block of a matrix, and may round otherwise: blocks that disagree
+    make no positive matrix. A ramp differs as little as its argument.
     """
     return jax.lax.stop_gradient(jnp.clip(value / width, 0.0, 1.0))
 

@@ -1,6 +1,6 @@
-"""All that follows from a state alone: rotations, axes, joint anchors, and how far joints are apart.
+"""Kinematics of a state: rotations, axes, joint anchors and joint displacements.
 
-World frame; arrays have the batch last, as in `linalg`. A step computes it once, and everything else takes it.
+World frame; arrays have the batch last, as in `linalg`. A step computes them once, and everything else takes them.
 """
 
 from __future__ import annotations
@@ -104,9 +104,9 @@ def local_anchors(scene: Scene, rows: np.ndarray, points: list[Vector], sizes: A
 def displacement(scene: Scene, state: Array, morphology: Array) -> Array:
     """Return joint displacements (*, J, 3) [m] of states (*, L, 13) and morphologies (*, L, 3): see `Kinematics`."""
     sizes = jnp.broadcast_to(jnp.asarray(morphology), (*state.shape[:-1], 3))
-    flat = (each.reshape(-1, *each.shape[-2:]) for each in (state, sizes))
-    seen = kinematics(scene, *(jnp.moveaxis(each, 0, -1) for each in flat))
-    return jnp.moveaxis(seen.displacement, -1, 0).reshape(*state.shape[:-2], -1, 3)
+    flat = (array.reshape(-1, *array.shape[-2:]) for array in (state, sizes))
+    links = kinematics(scene, *(jnp.moveaxis(array, 0, -1) for array in flat))
+    return jnp.moveaxis(links.displacement, -1, 0).reshape(*state.shape[:-2], -1, 3)
 
 
 def morphology_of(scene: Scene) -> Array:
@@ -115,22 +115,22 @@ def morphology_of(scene: Scene) -> Array:
 
 
 def motor_scale(body: Body, sizes: Array) -> Array:
-    """Return (B,) how many times as strong motors are in links of sizes (n, 3, B) as the body's own: `Body.sized`."""
-    return jnp.sum(sizes[:, 0], axis=0) * jnp.sum(sizes[:, 2], axis=0) / body.weighed
+    """Return the factor (B,) of the motors of links of sizes (n, 3, B) over the body's own: see `Body.sized`."""
+    return jnp.sum(sizes[:, 0], axis=0) * jnp.sum(sizes[:, 2], axis=0) / body.mass_length
 
 
-def ends_on_ground(seen: Kinematics, velocity: Array, angular_velocity: Array, dt: float) -> tuple[Array, Array]:
-    """Return how both ends of every link are to the ground: velocities (2 n, 3, B) where near it, and (6 n, B).
+def ends_on_ground(links: Kinematics, velocity: Array, angular_velocity: Array, dt: float) -> tuple[Array, Array]:
+    """Return velocities (2 n, 3, B) of both ends of every link, times their nearness, and features (6 n, B).
 
-    velocity, angular_velocity: of the links (n, 3, B). The second are clearance [m], nearness (1 on the ground, falling
-    off over 3 cm), and depth [m] after `dt`.
+    velocity, angular_velocity: of the links (n, 3, B). Features: clearance [m] over the ground, nearness (1 on the
+    ground, falling off over 3 cm), and depth [m] after `dt`.
     """
-    arms = jnp.concatenate([seen.half, -seen.half])
+    arms = jnp.concatenate([links.half, -links.half])
     position, velocity, angular_velocity, radius = (
-        jnp.concatenate([part, part]) for part in (seen.position, velocity, angular_velocity, seen.sizes[:, 1])
+        jnp.concatenate([values, values]) for values in (links.position, velocity, angular_velocity, links.sizes[:, 1])
     )
     velocity = velocity + cross(angular_velocity, arms)
     clearance = (position + arms)[:, 2] - radius
-    near = jnp.exp(-jnp.maximum(clearance, 0.0) / 0.03)
-    deep = jnp.minimum(clearance + dt * velocity[:, 2], 0.0)
-    return near[:, None] * velocity, jnp.concatenate([jnp.minimum(clearance, 0.1), near, deep])
+    nearness = jnp.exp(-jnp.maximum(clearance, 0.0) / 0.03)
+    depth = jnp.minimum(clearance + dt * velocity[:, 2], 0.0)
+    return nearness[:, None] * velocity, jnp.concatenate([jnp.minimum(clearance, 0.1), nearness, depth])

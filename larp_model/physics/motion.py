@@ -31,8 +31,8 @@ class Constants:
     """Constants of a body's motion that are chosen, not derived.
 
     closing: share of a joint's displacement that a step takes back (J. Baumgarte, Computer Methods 1 (1972)). standing:
-    an end in the ground is held as if by so many times its body's mass. iterations: of Newton's method in which
-    the ground's impulses are solved for, at most (`ground`).
+    regularisation mass of a contact with the ground, in masses of the body. iterations: of Newton's method for the
+    ground's impulses, at most (`ground`).
     """
 
     closing: float = 0.2
@@ -43,13 +43,13 @@ class Constants:
 class BodyMotion(NamedTuple):
     """Motion of a body within a step: (n, 3, B) each, world frame.
 
-    velocity [m/s] and spin [rad/s] at its end; moved [m] and turned [rad] during it.
+    velocity [m/s] and angular_velocity [rad/s] at its end; translation [m] and rotation_vector [rad] during it.
     """
 
     velocity: Array
-    spin: Array
-    moved: Array
-    turned: Array
+    angular_velocity: Array
+    translation: Array
+    rotation_vector: Array
 
 
 class Articulation(NamedTuple):
@@ -65,99 +65,126 @@ class Articulation(NamedTuple):
 
 
 Carry = tuple[Array, Array, Array, Array]
-"""Start of a stage: heights (n, 1, B) and rotation vectors (n, 3, B) gained, velocities and spins (n, 3, B)."""
+"""Start of a stage: rise (n, 1, B) and rotation vector (n, 3, B) so far, velocity, angular velocity (n, 3, B)."""
 
 
 def articulated_motion(
-    body: Body, seen: Kinematics, targets: Array, outside: Array, gravity: float, dt: float,
+    body: Body, links: Kinematics, targets: Array, torques: Array, gravity: float, dt: float,
     constants: Constants = Constants(),
 ) -> tuple[BodyMotion, Articulation]:  # fmt: skip
-    """Return how a body moves on within `dt` [s] if nothing but the ground touches it, and its inertia on the way.
+    """Return the motion of a body within `dt` [s] if nothing but the ground touches it, and its inertia meanwhile.
 
-    targets (j, 3, B) of its joints [rad], outside (n, 3, B) [N m] torque. The inertia is that of the first stage.
+    targets (j, 3, B) of its joints [rad], torques (n, 3, B) [N m], external. The inertia is that of the first stage.
     """
-    h, sizes, local = GAMMA * dt, seen.sizes, seen.local_anchors
+    h, sizes, local = GAMMA * dt, links.sizes, links.local_anchors
     parents = np.array([joint.parent for joint in body.joints], int)
-    orientation, velocity, spin = seen.orientation, seen.velocity, seen.angular_velocity
-    stronger = motor_scale(body, sizes)
+    orientation, velocity, angular_velocity = links.orientation, links.velocity, links.angular_velocity
+    scale = motor_scale(body, sizes)
     down = jnp.array([0.0, 0.0, -gravity], velocity.dtype)[:, None]
-    closing = -constants.closing / dt * seen.displacement
+    closing = -constants.closing / dt * links.displacement
 
     def stage(
-        raised: Array, turned: Array, velocity: Array, spin: Array
+        rise: Array, rotation_vector: Array, velocity: Array, angular_velocity: Array
     ) -> tuple[tuple[Array, Array], tuple[Inertia, Anchors]]:
-        """Return velocities and spins `h` later of links raised (n, 1, B) [m] and turned (n, 3, B) [rad] before."""
-        start = rotated(orientation, turned)
-        matrices = rotation_matrices(rotated(start, h * spin))
+        """Return velocities and angular velocities at the end of a stage, and inertia and anchors; see `Carry`."""
+        start_orientation = rotated(orientation, rotation_vector)
+        matrices = rotation_matrices(rotated(start_orientation, h * angular_velocity))
         inertia = inertias(body, matrices, sizes)
-        momentum, mass = mv(inertia.turning, spin), sizes[:, 2:3]
-        push = Momenta(momentum + h * (outside - cross(spin, momentum)), mass * (velocity + h * down))
+        momentum, mass = mv(inertia.angular, angular_velocity), sizes[:, 2:3]
+        momenta = Momenta(momentum + h * (torques - cross(angular_velocity, momentum)), mass * (velocity + h * down))
         anchors = turned_anchors(local, matrices, slice(1, None), parents)
-        before = rotation_matrices(start)
-        pull, hold = servos(body, start, before, targets, spin, h, stronger)
-        height = seen.position[:, 2:] + raised
-        anchors, pull, hold = barrier((anchors, pull, hold))
-        ends = Ends.of(body, before, height, velocity, spin, sizes, h, velocity_products(body, anchors, spin))
-        whole = jnp.sum(jnp.broadcast_to(mass, velocity[:, :1].shape), axis=0, keepdims=True)
-        problem = GroundProblem(inertia, push, anchors, closing, pull, hold, ends, constants.standing * whole, h)
-        motion = motion_on_ground(body, constants.iterations, problem, velocity + h * down, spin)
-        on_ground, _ = problem.linear(motion)
-        return (motion.velocity, motion.spin), (jax.tree.map(jnp.add, inertia, on_ground), anchors)
+        start_matrices = rotation_matrices(start_orientation)
+        impulse, resistance = servos(body, start_orientation, start_matrices, targets, angular_velocity, h, scale)
+        height = links.position[:, 2:] + rise
+        anchors, impulse, resistance = barrier((anchors, impulse, resistance))
+        ends = Ends.of(
+            body,
+            start_matrices,
+            height,
+            velocity,
+            angular_velocity,
+            sizes,
+            h,
+            velocity_products(body, anchors, angular_velocity),
+        )
+        total_mass = jnp.sum(jnp.broadcast_to(mass, velocity[:, :1].shape), axis=0, keepdims=True)
+        problem = GroundProblem(
+            inertia, momenta, anchors, closing, impulse, resistance, ends, constants.standing * total_mass, h
+        )
+        motion = motion_on_ground(body, constants.iterations, problem, velocity + h * down, angular_velocity)
+        ground_inertia, _ = problem.linear(motion)
+        return (motion.velocity, motion.angular_velocity), (jax.tree.map(jnp.add, inertia, ground_inertia), anchors)
 
     ratio = (1.0 - GAMMA) / GAMMA
 
-    def advance(begun: Carry, nothing: None) -> tuple[Carry, tuple[tuple[Array, Array], tuple[Inertia, Anchors]]]:
-        raised, turned, velocity, spin = begun
-        after, tree = stage(raised, turned, velocity, spin)
-        late = (1.0 - GAMMA) * dt
-        goes_on = velocity + ratio * (after[0] - velocity), spin + ratio * (after[1] - spin)
-        return (late * after[0][:, 2:], late * after[1], *goes_on), (after, tree)
+    def advance(carry: Carry, _: None) -> tuple[Carry, tuple[tuple[Array, Array], tuple[Inertia, Anchors]]]:
+        rise, rotation_vector, velocity, angular_velocity = carry
+        end_velocities, inertia_and_anchors = stage(rise, rotation_vector, velocity, angular_velocity)
+        remaining_time = (1.0 - GAMMA) * dt
+        extrapolated = (
+            velocity + ratio * (end_velocities[0] - velocity),
+            angular_velocity + ratio * (end_velocities[1] - angular_velocity),
+        )
+        return (remaining_time * end_velocities[0][:, 2:], remaining_time * end_velocities[1], *extrapolated), (
+            end_velocities,
+            inertia_and_anchors,
+        )
 
-    still = jnp.zeros_like(spin)
-    _, ((velocities, spins), stages) = jax.lax.scan(advance, (still[:, 2:], still, velocity, spin), length=2)
-    moved, turned = (dt * ((1.0 - GAMMA) * one + GAMMA * two) for one, two in (velocities, spins))
-    inertia, anchors = jax.tree.map(lambda each: each[0], stages)
+    zero = jnp.zeros_like(angular_velocity)
+    _, ((velocities, angular_velocities), stages) = jax.lax.scan(
+        advance, (zero[:, 2:], zero, velocity, angular_velocity), length=2
+    )
+    translation, rotation_vector = (
+        dt * ((1.0 - GAMMA) * one + GAMMA * two) for one, two in (velocities, angular_velocities)
+    )
+    inertia, anchors = jax.tree.map(lambda values: values[0], stages)
     # Accelerations k_1 and k_2 at GAMMA and 1 of the step are (1 - GAMMA) k_1 + GAMMA k_2 on average, as if straight.
     jerk, angular_jerk = (
         ((after[1] - before) / dt - (after[0] - before) / h) / (GAMMA * (1.0 - GAMMA) * dt)
-        for after, before in ((velocities, velocity), (spins, spin))
+        for after, before in ((velocities, velocity), (angular_velocities, angular_velocity))
     )
-    return BodyMotion(velocities[1], spins[1], moved, turned), Articulation(inertia, anchors, jerk, angular_jerk)
+    return BodyMotion(velocities[1], angular_velocities[1], translation, rotation_vector), Articulation(
+        inertia, anchors, jerk, angular_jerk
+    )
 
 
-def velocity_products(body: Body, anchors: Anchors, spin: Array) -> tuple[Array, Array]:
+def velocity_products(body: Body, anchors: Anchors, angular_velocity: Array) -> tuple[Array, Array]:
     """Return accelerations (n, 3, B) [m/s^2] and [rad/s^2] of links whose root and joints do not accelerate.
 
     MuJoCo leaves them out of a contact's acceleration. anchors: from links' centres to their joints.
     """
     parents = np.array([joint.parent for joint in body.joints], int)
-    # How the two points of a joint accelerate apart as their links turn, and the joint's axes with the child.
-    closing = cross(spin[parents], cross(spin[parents], anchors.parent))
-    closing -= cross(spin[1:], cross(spin[1:], anchors.child))
-    carried = cross(spin[1:], spin[1:] - spin[parents])
-    velocity = turning = jnp.zeros_like(spin[:1])
+    # Relative acceleration of the two points of a joint as their links turn, and of the joint's axes with the child.
+    separation = cross(angular_velocity[parents], cross(angular_velocity[parents], anchors.parent))
+    separation -= cross(angular_velocity[1:], cross(angular_velocity[1:], anchors.child))
+    relative = cross(angular_velocity[1:], angular_velocity[1:] - angular_velocity[parents])
+    linear = angular = jnp.zeros_like(angular_velocity[:1])
     rows = np.array([0])
-    for level, above in tree(body):
-        known, joint = np.array([int(np.flatnonzero(rows == row)[0]) for row in above]), level - 1
-        outer = turning[known] + carried[joint]
-        moving = velocity[known] + cross(turning[known], anchors.parent[joint]) - cross(outer, anchors.child[joint])
-        velocity, turning = jnp.concatenate([velocity, moving + closing[joint]]), jnp.concatenate([turning, outer])
+    for level, level_parents in tree(body):
+        parent_rows, joint = np.array([int(np.flatnonzero(rows == row)[0]) for row in level_parents]), level - 1
+        outer = angular[parent_rows] + relative[joint]
+        translated = (
+            linear[parent_rows]
+            + cross(angular[parent_rows], anchors.parent[joint])
+            - cross(outer, anchors.child[joint])
+        )
+        linear, angular = jnp.concatenate([linear, translated + separation[joint]]), jnp.concatenate([angular, outer])
         rows = np.concatenate([rows, level])
     order = np.argsort(rows)
-    return velocity[order], turning[order]
+    return linear[order], angular[order]
 
 
 def servos(
-    body: Body, orientation: Array, matrices: Array, targets: Array, spin: Array, h: float, stronger: Array
+    body: Body, orientation: Array, matrices: Array, targets: Array, angular_velocity: Array, h: float, scale: Array
 ) -> tuple[Array, Array]:
-    """Return pull (n - 1, 3, B) and hold (n - 1, 3, 3, B) of all joints within `h` [s]; see `articulated`.
+    """Return impulse (n - 1, 3, B) and resistance (n - 1, 3, 3, B) of all joints within `h` [s]; see `articulated`.
 
-    orientation (n, 4, B) and its matrices (n, 3, 3, B), targets (j, 3, B) [rad], spin (n, 3, B); stronger (B or 1,) is
-    `kinematics.motor_scale`. A servo that is at its limit pulls on, and yields.
+    orientation (n, 4, B) and its matrices (n, 3, 3, B), targets (j, 3, B) [rad], angular_velocity (n, 3, B); scale
+    (B or 1,) is `kinematics.motor_scale`. A servo at its torque limit has no stiffness.
     """
-    links, batch = len(body.links), spin.shape[-1]
+    links, batch = len(body.links), angular_velocity.shape[-1]
     motors, passive = np.zeros((4, links - 1, 1, 1), np.float32), np.zeros((links - 1, 1, 1), np.float32)
-    aim, motor_rows = jnp.zeros((links - 1, 3, batch), spin.dtype), []
+    padded_targets, motor_rows = jnp.zeros((links - 1, 3, batch), angular_velocity.dtype), []
     for child, joint in enumerate(body.joints):
         motor = joint.motor
         if motor is None:
@@ -165,19 +192,19 @@ def servos(
         else:
             motors[:, child, 0, 0] = motor.stiffness, motor.torque_limit, motor.armature, motor.damping
             motor_rows.append(child)
-    stiffness, limit, armature, damping = stronger * jnp.asarray(motors)
+    stiffness, limit, armature, damping = scale * jnp.asarray(motors)
     parents = np.array([joint.parent for joint in body.joints], int)
     matrices = matrices[1:]
-    unit = jnp.eye(3, dtype=spin.dtype)[..., None]
-    free = armature + h * (damping + passive)
-    pull = armature * (spin[1:] - spin[parents])
+    unit = jnp.eye(3, dtype=angular_velocity.dtype)[..., None]
+    damping_and_armature = armature + h * (damping + passive)
+    impulse = armature * (angular_velocity[1:] - angular_velocity[parents])
     if not motor_rows:
-        return pull, jnp.broadcast_to(free[:, :, None] * unit, (links - 1, 3, 3, batch))
-    aim = aim.at[np.array(motor_rows)].set(targets)
-    wanted = stiffness * (aim - angles(orientation[parents], orientation[1:]))
-    giving = h**2 * stiffness * (jnp.abs(wanted) < limit)
-    hold = mm(matrices * giving[:, None], jnp.swapaxes(matrices, 1, 2)) + free[:, :, None] * unit
-    return pull + h * mv(matrices, jnp.clip(wanted, -limit, limit)), hold
+        return impulse, jnp.broadcast_to(damping_and_armature[:, :, None] * unit, (links - 1, 3, 3, batch))
+    padded_targets = padded_targets.at[np.array(motor_rows)].set(targets)
+    torque = stiffness * (padded_targets - angles(orientation[parents], orientation[1:]))
+    spring = h**2 * stiffness * (jnp.abs(torque) < limit)
+    resistance = mm(matrices * spring[:, None], jnp.swapaxes(matrices, 1, 2)) + damping_and_armature[:, :, None] * unit
+    return impulse + h * mv(matrices, jnp.clip(torque, -limit, limit)), resistance
 
 
 def angles(parent: Array, child: Array) -> Array:
@@ -198,12 +225,12 @@ def moments(length: Array, radius: Array, mass: Array) -> tuple[Array, Array]:
 
 
 def inertias(body: Body, matrices: Array, sizes: Array) -> Inertia:
-    """Return those of the links alone, in world axes."""
+    """Return the inertias of the links alone, in world axes."""
     along, across = moments(sizes[:, 0], sizes[:, 1], sizes[:, 2])
     axes = np.array([link.axis for link in body.links], np.float32)
     axis = mv(matrices, jnp.asarray(axes, matrices.dtype)[..., None])
     outer = axis[:, :, None] * axis[:, None, :]
     unit = jnp.eye(3, dtype=matrices.dtype)[..., None]
-    turning = across[:, None, None] * unit + (along - across)[:, None, None] * outer
-    moving = jnp.broadcast_to(sizes[:, 2][:, None, None] * unit, turning.shape)
-    return Inertia(turning, jnp.zeros_like(turning), moving)
+    angular = across[:, None, None] * unit + (along - across)[:, None, None] * outer
+    linear = jnp.broadcast_to(sizes[:, 2][:, None, None] * unit, angular.shape)
+    return Inertia(angular, jnp.zeros_like(angular), linear)

@@ -1,13 +1,13 @@
-"""Response of an articulated body to impulses: the velocities of all its links, which servos take back.
+"""Response of an articulated body to impulses: velocities of all its links, of which servos take back a part.
 
-What links have gained a time t after a unit impulse is w(t). Joints resist at once by their armature alone, and later
-by damping and stiffness as well. An implicit step of length T knows
+A unit impulse changes the links' velocities by w(t), a time t later. Joints resist at once by their armature alone, and
+later by damping and stiffness as well. An implicit step of length T gives
 
     W(T) = (M + T D + T^2 K)^-1 = integral of w(t) exp(-t / T) dt / T
 
-so that w(t) = W_kept + W_fading exp(-t / T) is right at once and on average over T.
+so that w(t) = W_lasting + W_transient exp(-t / T) is right at once and on average over T.
 
-Arrays have the batch last, as in `linalg`; C impulses are worked on side by side, (n, 3, C, B).
+Arrays have the batch last, as in `linalg`; C impulses are treated side by side, (n, 3, C, B).
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from jax import Array
 
 from larp_model.linalg import barrier, cross_columns, mm
 from larp_model.physics.articulated import (
+    EliminatedJoint,
     Inertia,
-    Joined,
     Momenta,
-    carried_back,
     inverse_inertia,
-    inwards,
+    inward_pass,
     levels_of,
     packed_inertia,
+    shifted_wrench,
     tree,
     with_children,
 )
@@ -40,70 +40,73 @@ Arrays = TypeVar("Arrays", Articulation, Momenta)
 
 
 class Gains(NamedTuple):
-    """Velocities and spins (n, 3, C, B) that links gain, per impulse [N s] or moment [N m s]."""
+    """Changes (n, 3, C, B) of velocities and angular velocities, per impulse [N s] or angular impulse [N m s]."""
 
     velocity: Array
-    spin: Array
+    angular_velocity: Array
 
 
 def responses(
-    body: Body, articulation: Articulation, pushes: Momenta, sizes: Array, fade: float
+    body: Body, articulation: Articulation, impulses: Momenta, sizes: Array, relaxation_time: float
 ) -> tuple[Gains, Gains]:
-    """Return what links keep and what fades within `fade` [s], of impulses (n, 3, C, B) on all links.
+    """Return the lasting and the transient response to impulses (n, 3, C, B) on all links; see the module.
 
-    sizes (n, 3, B). See the module.
+    sizes (n, 3, B). relaxation_time: the module's T [s].
     """
     if not body.joints:
-        kept = _gained(body, articulation.anchors, [], inverse_inertia(articulation.inertia), pushes)
-        return kept, Gains(*(jnp.zeros_like(each) for each in kept))
+        lasting = _gains(body, articulation.anchors, [], inverse_inertia(articulation.inertia), impulses)
+        return lasting, Gains(*(jnp.zeros_like(gain) for gain in lasting))
     # W(0) and W(T) side by side.
     doubled = _twice(articulation)
-    resisting = jnp.concatenate([_resistance(body, sizes, after) for after in (0.0, fade)], axis=-1)
+    resistance = jnp.concatenate([_resistance(body, sizes, time) for time in (0.0, relaxation_time)], axis=-1)
     unit = jnp.eye(3, dtype=sizes.dtype)[..., None]
-    still = jnp.zeros_like(doubled.inertia.moving[:, 0])
-    levels = levels_of(body, doubled.anchors, still[1:], still[1:], resisting * unit)
-    whole, _, joints = inwards(doubled.inertia, Momenta(still, still), levels)
-    gained = _gained(body, doubled.anchors, joints, inverse_inertia(whole), _twice(pushes))
-    now, later = (Gains(*each) for each in zip(*(jnp.split(each, 2, axis=-1) for each in gained), strict=True))
-    # W(0) = kept + fading, W(T) = kept + fading / 2
-    kept = Gains(*(2.0 * b - a for a, b in zip(now, later, strict=True)))
-    return kept, Gains(*(2.0 * (a - b) for a, b in zip(now, later, strict=True)))
+    zero = jnp.zeros_like(doubled.inertia.linear[:, 0])
+    levels = levels_of(body, doubled.anchors, zero[1:], zero[1:], resistance * unit)
+    root, _, joints = inward_pass(doubled.inertia, Momenta(zero, zero), levels)
+    gains = _gains(body, doubled.anchors, joints, inverse_inertia(root), _twice(impulses))
+    now, later = (Gains(*gain) for gain in zip(*(jnp.split(gain, 2, axis=-1) for gain in gains), strict=True))
+    # W(0) = lasting + transient, W(T) = lasting + transient / 2
+    lasting = Gains(*(2.0 * b - a for a, b in zip(now, later, strict=True)))
+    return lasting, Gains(*(2.0 * (a - b) for a, b in zip(now, later, strict=True)))
 
 
-def _resistance(body: Body, sizes: Array, after: float) -> Array:
-    """Return (n - 1, 1, 1, B) [kg m^2] the moment that joints have taken up after a time [s], per spin."""
-    stronger = motor_scale(body, sizes)
+def _resistance(body: Body, sizes: Array, time: float) -> Array:
+    """Return (n - 1, 1, 1, B) [kg m^2] the angular impulse of joints within a time [s], per angular velocity."""
+    scale = motor_scale(body, sizes)
     rows = []
     for joint in body.joints:
         if joint.motor is None:
-            rows.append(jnp.full_like(stronger, after * joint.damping))
+            rows.append(jnp.full_like(scale, time * joint.damping))
         else:
             motor = joint.motor
-            rows.append(stronger * (motor.armature + after * motor.damping + after**2 * motor.stiffness))
+            rows.append(scale * (motor.armature + time * motor.damping + time**2 * motor.stiffness))
     return jnp.stack(rows)[:, None, None]
 
 
-def _gained(body: Body, anchors: Anchors, joints: list[Joined], root: Inertia, pushes: Momenta) -> Gains:
-    """Return what links gain by pushes, the inertias of the tree being known: see `articulated.inwards`."""
-    levels, halves = tree(body), []
-    every = jnp.concatenate([pushes.turning, pushes.moving], axis=1)
-    handed, below = every[:0], np.array([], int)
-    for (rows, above), joint in zip(reversed(levels), reversed(joints), strict=True):
-        own = barrier(with_children(every[rows], rows, handed, below))
+def _gains(body: Body, anchors: Anchors, joints: list[EliminatedJoint], root: Inertia, impulses: Momenta) -> Gains:
+    """Return the gains of impulses, for joints that `articulated.inward_pass` has eliminated."""
+    levels, factors = tree(body), []
+    wrenches = jnp.concatenate([impulses.angular, impulses.linear], axis=1)
+    from_children, child_parents = wrenches[:0], np.array([], int)
+    for (rows, parents), joint in zip(reversed(levels), reversed(joints), strict=True):
+        own = barrier(with_children(wrenches[rows], rows, from_children, child_parents))
         child, arm = anchors.child[rows - 1], anchors.child[rows - 1] - anchors.parent[rows - 1]
-        half = barrier(mm(joint.solved, own[:, :3] - cross_columns(child, own[:, 3:])))
-        halves.append(half)
-        handed, below = barrier(carried_back(arm, own - mm(jnp.swapaxes(joint.half, 1, 2), half))), above
-    at_root = with_children(every[:1], np.array([0]), handed, below)
+        factored = barrier(mm(joint.inverse_factor, own[:, :3] - cross_columns(child, own[:, 3:])))
+        factors.append(factored)
+        from_children, child_parents = (
+            barrier(shifted_wrench(arm, own - mm(jnp.swapaxes(joint.factored, 1, 2), factored))),
+            parents,
+        )
+    at_root = with_children(wrenches[:1], np.array([0]), from_children, child_parents)
     motions, order = [mm(packed_inertia(root), at_root)], [np.array([0])]
-    for (rows, above), joint, half in zip(levels, joints, reversed(halves), strict=True):
-        parent = motions[-1][np.searchsorted(order[-1], above)]
+    for (rows, parents), joint, factored in zip(levels, joints, reversed(factors), strict=True):
+        parent_motions = motions[-1][np.searchsorted(order[-1], parents)]
         child, arm = anchors.child[rows - 1], anchors.child[rows - 1] - anchors.parent[rows - 1]
-        carried = parent[:, 3:] + cross_columns(arm, parent[:, :3])
-        given = jnp.concatenate([parent[:, :3], carried], axis=1)
-        relative = barrier(mm(jnp.swapaxes(joint.solved, 1, 2), half) - mm(joint.by_parent, given))
-        velocity = carried + cross_columns(child, relative)
-        motions.append(barrier(jnp.concatenate([parent[:, :3] + relative, velocity], axis=1)))
+        transported = parent_motions[:, 3:] + cross_columns(arm, parent_motions[:, :3])
+        parent_motion = jnp.concatenate([parent_motions[:, :3], transported], axis=1)
+        relative = barrier(mm(jnp.swapaxes(joint.inverse_factor, 1, 2), factored) - mm(joint.by_parent, parent_motion))
+        velocity = transported + cross_columns(child, relative)
+        motions.append(barrier(jnp.concatenate([parent_motions[:, :3] + relative, velocity], axis=1)))
         order.append(rows)
     motion = jnp.concatenate(motions)[np.argsort(np.concatenate(order))]
     return Gains(motion[:, 3:], motion[:, :3])
@@ -111,5 +114,5 @@ def _gained(body: Body, anchors: Anchors, joints: list[Joined], root: Inertia, p
 
 def _twice(arrays: Arrays) -> Arrays:
     """Return arrays (..., B) as (..., 2 B)."""
-    doubled: Arrays = jax.tree.map(lambda each: jnp.concatenate([each, each], axis=-1), arrays)
+    doubled: Arrays = jax.tree.map(lambda array: jnp.concatenate([array, array], axis=-1), arrays)
     return doubled
