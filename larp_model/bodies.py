@@ -14,7 +14,7 @@ from larp_model.scene import Body, Joint, Link, Pair, Scene, Surface, Vector
 
 # A kicked football stays on the foot for about 10 ms and rebounds to 1.35-1.55 m when dropped from 2 m.
 BALL_SURFACE = Surface.bouncing(contact_time=0.010, restitution=0.86, friction=0.6)
-# One leg on the other: flesh gives for longer than a ball, and gives little back. Chosen, not measured.
+# One leg on the other: flesh has a longer contact time and less restitution than a ball. Chosen, not measured.
 LEG_SURFACE = Surface.bouncing(contact_time=0.020, restitution=0.4, friction=0.5)
 
 
@@ -139,8 +139,8 @@ def _usual_human(name: str, detail: Detail) -> Body:
         return Joint(parent, (at[0], sign * at[1], at[2]), (own[0], sign * own[1], own[2]), motor)
 
     links = (
-        Link(each, part.length, part.radius, 70.0 * part.share, part.axis)
-        for each, (part, _) in zip(names, rows, strict=True)
+        Link(link_name, part.length, part.radius, 70.0 * part.share, part.axis)
+        for link_name, (part, _) in zip(names, rows, strict=True)
     )
     return Body(name, KINDS[detail], tuple(links), tuple(joint(*row) for row in rows[1:]))
 
@@ -167,7 +167,7 @@ def kicking_links(person: Body) -> tuple[str, ...]:
 
 
 def _legs(person: Body) -> Pair:
-    """Return the pair of both legs below the knee: above it they touch whenever one stands, and flesh gives way."""
+    """Return the pair of both legs below the knee: above it they touch in any standing pose, and flesh is soft."""
     below = [name for name in kicking_links(person) if segment_of(name) != "thigh"]
     left, right = (tuple(name for name in below if name.startswith(side)) for side in ("left_", "right_"))
     return Pair(person.name, person.name, left, right, LEG_SURFACE)

@@ -39,10 +39,10 @@ def hidden() -> str | None:
     """Return what is wrong if a package of another project has the name of one of ours; None if none has."""
     for name in ("mpc", "viewer", "tasks"):
         spec = find_spec(name)
-        found = None if spec is None or spec.origin is None else Path(spec.origin).resolve().parent
-        if found != HOME / name:
-            there = "is not installed" if found is None else f"is at {found}, another project's"
-            return f"the package {name!r} {there}, but larp-mpc needs its own, which belongs in {HOME}"
+        folder = None if spec is None or spec.origin is None else Path(spec.origin).resolve().parent
+        if folder != HOME / name:
+            difference = "is not installed" if folder is None else f"is at {folder}, another project's"
+            return f"the package {name!r} {difference}, but larp-mpc needs its own, which belongs in {HOME}"
     return None
 
 

@@ -1,4 +1,4 @@
-"""Error against the truth: by horizon, in joints, and of the velocity with which a struck body leaves."""
+"""Error against the ground truth: by horizon, in joints, and of the velocity with which a struck body leaves."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from larp_model.state import Trajectories
 
-# Beyond this a prediction has diverged [m].
+# Error beyond which a prediction has diverged [m].
 DIVERGED = 20.0
 
 
@@ -38,17 +38,17 @@ def evaluate(simulator: Simulator, episodes: Trajectories, windows: Sequence[int
     scene = simulator.scene
     controls, torques = episodes.controls[:, :longest], episodes.torques[:, :longest]
     predicted = predict(simulator, episodes.states[:, 0], controls, torques, episodes.morphology)
-    distance, kept = distances(predicted, episodes, longest)
+    distance, finite = distances(predicted, episodes, longest)
     true = episodes.states[:, 1 : longest + 1]
     relative = rotation.multiply(
-        jnp.asarray(predicted[kept][..., packed.ORIENTATION]),
-        rotation.conjugate(jnp.asarray(true[kept][..., packed.ORIENTATION])),
+        jnp.asarray(predicted[finite][..., packed.ORIENTATION]),
+        rotation.conjugate(jnp.asarray(true[finite][..., packed.ORIENTATION])),
     )
-    apart = kinematics.displacement(
-        scene, jnp.asarray(predicted[kept]), jnp.asarray(episodes.morphology[kept][:, None])
+    displacements = kinematics.displacement(
+        scene, jnp.asarray(predicted[finite]), jnp.asarray(episodes.morphology[finite][:, None])
     )
     return {
-        "windows": by_window(scene, distance[kept], windows),
+        "windows": by_window(scene, distance[finite], windows),
         "rotation_rad": {
             body.name: mean(
                 jnp.linalg.norm(rotation.to_rotation_vector(relative[:, :, scene.rows(body.name)]), axis=-1)
@@ -56,9 +56,9 @@ def evaluate(simulator: Simulator, episodes: Trajectories, windows: Sequence[int
             for body in scene.bodies
             if not body.is_ball
         },
-        "displacement_m": mean(jnp.linalg.norm(apart, axis=-1)) if apart.shape[-2] else 0.0,
+        "displacement_m": mean(jnp.linalg.norm(displacements, axis=-1)) if displacements.shape[-2] else 0.0,
         "sequences": len(episodes.states),
-        "diverged": int((~kept).sum()),
+        "diverged": int((~finite).sum()),
         "launch": launched(simulator, episodes),
     }
 
@@ -73,25 +73,27 @@ def launched(simulator: Simulator, episodes: Trajectories) -> dict[str, Any]:
 def novelty(simulator: Simulator, states: np.ndarray, controls: np.ndarray) -> float:
     """Return how far states (T + 1, L, 13) under controls (T, J, 3) [rad] are from the training data.
 
-    Root mean square, over steps and features, of what the networks of the bodies see, in standard deviations of their
-    training data, over which it is 1; of the body that is furthest from its own. Contacts are left out: where links
-    are apart their networks see anything, and are not heard.
+    Root mean square, over steps and features, of the inputs of the bodies' networks, in standard deviations of their
+    training data, over which it is 1; the largest of all bodies. Contacts are left out: where links are apart, the
+    inputs of their networks are arbitrary and have no effect.
     """
-    given = (jnp.asarray(each, jnp.float32) for each in (states[:-1], states[1:], controls, simulator.morphology[None]))
-    return float(_novelty(simulator.model, simulator.weights, *given))
+    arrays = (
+        jnp.asarray(array, jnp.float32) for array in (states[:-1], states[1:], controls, simulator.morphology[None])
+    )
+    return float(_novelty(simulator.model, simulator.weights, *arrays))
 
 
 @partial(jax.jit, static_argnums=0)
 def _novelty(model: Model, weights: Weights, before: Array, after: Array, controls: Array, sizes: Array) -> Array:
-    seen = model.measure(before, after, controls, jnp.zeros((*before.shape[:2], 3)), sizes)
+    measured = model.measure(before, after, controls, jnp.zeros((*before.shape[:2], 3)), sizes)
     names = [name for name in model.networks() if name.startswith("dynamics/")]
-    return jnp.stack([weights.inputs[name].novelty(seen[name][0]) for name in sorted(names)]).max()
+    return jnp.stack([weights.inputs[name].novelty(measured[name][0]) for name in sorted(names)]).max()
 
 
 def distances(predicted: np.ndarray, episodes: Trajectories, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the links' distance from the ground truth (E, steps, L) [m], and (E,) which episodes did not diverge."""
-    apart = predicted[:, :steps, :, packed.POSITION] - episodes.states[:, 1 : steps + 1, :, packed.POSITION]
-    distance = np.linalg.norm(apart, axis=-1)
+    """Return the links' distance (E, steps, L) [m] from the ground truth, and a mask (E,): no divergence."""
+    offset = predicted[:, :steps, :, packed.POSITION] - episodes.states[:, 1 : steps + 1, :, packed.POSITION]
+    distance = np.linalg.norm(offset, axis=-1)
     return distance, np.isfinite(distance).all(axis=(1, 2)) & (distance.max(axis=(1, 2)) < DIVERGED)
 
 

@@ -1,6 +1,6 @@
-"""Launches: error of the velocity with which a struck ball leaves, apart by how it is struck.
+"""Launches: error of the velocity of a struck ball after the contact, by kinds of contact.
 
-What is struck is the second body of the scene's first pair, if it is a single link; here it is called the ball.
+The ball is the second body of the scene's first pair, if that is a single link.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ STEPS, SLOWEST = 8, 1.5
 TOUCHING, LYING = 1e-3, 0.01
 # A push changes the ball's velocity in a step by more than gravity and rolling do [m/s].
 PUSH = 0.3
-# Bounds of the speeds [m/s] by which launches are told apart.
+# Bounds of the classes of speed [m/s].
 SPEEDS = (2.0, 9.0, 14.0)
-# Links of which one strikes much as its mirror image does.
+# Sides, which are not distinguished: a link strikes much as its mirror image does.
 SIDES = ("left_", "right_")
-# Steps looked at in one go, by one compiled program.
+# Steps of one call of the compiled program.
 CHUNK = 1024
 
 
@@ -40,8 +40,8 @@ class Launches(NamedTuple):
     """N launches in the ground truth, and the errors of their prediction.
 
     error: (N,) |v - v'| / |v|, inf where the prediction diverged. angle: (N,) between v and v' [degrees]. speed: (N,)
-    of the ball [m/s]. lying: (N,) whether it lay on the ground. steps: (N,) in which it was pushed. by: (N, P) which
-    links touched it, of those that can, whose names are `links`.
+    of the ball [m/s]. lying: (N,) whether it lay on the ground. steps: (N,) in which it was pushed. by: mask (N, P) of
+    the links that touched it, of those that can, whose names are `links`.
     """
 
     error: np.ndarray
@@ -58,7 +58,7 @@ class Launches(NamedTuple):
         slow, medium, fast = SPEEDS
         several, groups = self.by.sum(axis=1) > 1, [_without_side(link) for link in self.links]
         alone = {
-            f"by the {group}": ~several & self.by[:, [each == group for each in groups]].any(axis=1)
+            f"by the {group}": ~several & self.by[:, [other == group for other in groups]].any(axis=1)
             for group in dict.fromkeys(groups)
         }
         pushed = (self.steps >= 3) | several | alone.get("by the shin", np.zeros(len(self.error), bool))
@@ -74,7 +74,7 @@ class Launches(NamedTuple):
             "three steps and more": self.steps >= 3,
             **alone,
             "by several links": several,
-            # Slow and long contacts, shins, several links: what planners come upon and random kicks seldom show.
+            # Slow and long contacts, shins, several links: frequent in plans, and rare in random kicks.
             "pushes": (self.speed >= slow) & (self.speed < medium) & pushed,
         }
         return {name: which for name, which in kinds.items() if which.any()}
@@ -166,7 +166,8 @@ def _pushes(scene: Scene, before: Array, after: Array, morphology: Array) -> Arr
     ball = scene.index(pair.second, pair.second_links[0])
     free = jnp.array([0.0, 0.0, -scene.gravity * scene.dt], before.dtype)
     change = packed.velocity(after)[:, ball] - packed.velocity(before)[:, ball] - free
-    return (points.lowest < TOUCHING) & (jnp.linalg.norm(change, axis=-1) > PUSH)[:, None]
+    pushes: Array = (points.lowest < TOUCHING) & (jnp.linalg.norm(change, axis=-1) > PUSH)[:, None]
+    return pushes
 
 
 def _without_side(link: str) -> str:
@@ -174,4 +175,5 @@ def _without_side(link: str) -> str:
 
 
 def _speed(links: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(links[..., packed.VELOCITY], axis=-1)
+    speed: np.ndarray = np.linalg.norm(links[..., packed.VELOCITY], axis=-1)
+    return speed

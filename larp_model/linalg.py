@@ -5,11 +5,19 @@ Products are sums and stacks of slices: XLA makes one quick loop over the batch 
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-barrier = jax.lax.optimization_barrier
+Arrays = TypeVar("Arrays")
+
+
+def barrier(arrays: Arrays) -> Arrays:
+    """Return arrays as they are; XLA computes them before it uses them, once, and moves nothing across."""
+    same: Arrays = jax.lax.optimization_barrier(arrays)  # type: ignore[no-untyped-call]
+    return same
 
 
 def mv(matrix: Array, vector: Array) -> Array:
@@ -53,7 +61,7 @@ def cross_rows(matrix: Array, vector: Array) -> Array:
 
 
 def _cross(first: Array, second: Array, axis: int) -> Array:
-    (a, b, c), (x, y, z) = (jnp.moveaxis(each, axis, 0) for each in (first, second))
+    (a, b, c), (x, y, z) = (jnp.moveaxis(array, axis, 0) for array in (first, second))
     return jnp.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=axis)
 
 

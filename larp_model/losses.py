@@ -1,4 +1,4 @@
-"""Losses of an unrolled trajectory against the truth (equations 2 to 5 of the paper)."""
+"""Losses of an unrolled trajectory against the ground truth (equations 2 to 5 of the paper)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from larp_model import state as packed
 from larp_model.physics import kinematics
 from larp_model.scene import Scene
 
-# Where a predicted link is further than this from the truth, the sequence has gone another way [m].
+# Distance of a predicted link from the ground truth beyond which a sequence is lost [m].
 LOST = 1.0
 
 
@@ -50,19 +50,21 @@ def total(
     """Return the weighted sum and its terms, means over states (B, H, L, 13); `emphasis` (L,) weighs positions.
 
     morphology (B or 1, L, 3).
-    From where a sequence strays further than `LOST` it teaches nothing: that is left out, and "lost" is its share.
+    States from the first with an error beyond `LOST` on are left out; "lost" is their share.
     """
-    places = position(predicted, true)
-    near = jnp.cumprod(jnp.max(places, axis=2) < LOST**2, axis=1)
-    kept = jax.lax.stop_gradient(near).astype(places.dtype)
+    squared_distances = position(predicted, true)
+    on_track = jnp.cumprod(jnp.max(squared_distances, axis=2) < LOST**2, axis=1)
+    valid = jax.lax.stop_gradient(on_track).astype(squared_distances.dtype)
 
     def mean(values: Array) -> Array:
-        return jnp.sum(kept * jnp.sum(values, axis=2)) / (jnp.maximum(jnp.sum(kept), 1.0) * places.shape[2])
+        return jnp.sum(valid * jnp.sum(values, axis=2)) / (
+            jnp.maximum(jnp.sum(valid), 1.0) * squared_distances.shape[2]
+        )
 
     terms = {
-        "position": mean(emphasis * places),
+        "position": mean(emphasis * squared_distances),
         "rotation": mean(rotation(predicted, true)),
         "displacement": mean(displacement(scene, predicted, morphology[:, None])),
     }
     loss = jnp.sum(jnp.stack([weight * terms[name] for name, weight in weights._asdict().items()]))
-    return loss, terms | {"lost": 1.0 - jnp.mean(kept)}
+    return loss, terms | {"lost": 1.0 - jnp.mean(valid)}

@@ -1,9 +1,9 @@
 """A humanoid from an MJCF file, in the links and joints of our lean human.
 
-Every body of the file is one of our links, by its name, or rides on the link above it; the hinges between two links
-become one ball joint, where they are on average, and what is welded is held by a servo. Links keep their mass, the
-place of their joints, and the length and volume of their geoms; legs and arms are put to hang, as ours do in rest, and
-servos and bounds of joints are ours, in proportion. What cannot be said in that way is refused by name.
+Every body of the file is one of our links, by its name, or is fixed to the link above it; the hinges between two links
+become one ball joint at their mean position, and welded links get a servo. Links keep their mass, the place of their
+joints, and the length and volume of their geoms; legs and arms are turned to hang, as ours do in rest, and servos and
+bounds of joints are ours, in proportion. What does not fit is refused by name.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from larp_model.errors import InputError
 from larp_model.names import require_file, require_known
 from larp_model.scene import Body, Joint, Link, Vector
 
-# What files call our segments, apart from sides.
+# Names of our segments in files, without sides.
 SYNONYMS = {
     "pelvis": ("pelvis", "hips"),
     "torso": ("torso", "chest", "trunk", "spine"),
@@ -37,12 +37,12 @@ SYNONYMS = {
 }
 # Segments that hang down in our rest pose, whatever the file's.
 HANGING = ("upper_arm", "lower_arm", "thigh", "shin")
-# A ball is made so much longer, in its radius: places on a link are told along it, in its length.
+# Least length of a link, in its radius: anchors along a link are in units of its length.
 ROUNDEST = 0.1
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
-class Placed(NamedTuple):
+class LinkGeometry(NamedTuple):
     """A link as the file has it: ends (G, 2, 3) and radii (G,) of its geoms [m], and its mass [kg]."""
 
     ends: np.ndarray
@@ -50,7 +50,7 @@ class Placed(NamedTuple):
     mass: float
 
 
-class Tie(NamedTuple):
+class FileJoint(NamedTuple):
     """A link's joint with its parent: its place (3,) [m], in the middle of its hinges, and whether it is welded."""
 
     place: np.ndarray
@@ -60,8 +60,8 @@ class Tie(NamedTuple):
 def humanoid(source: str | Path, names: Mapping[str, str] | None = None, name: str = "human") -> Body:
     """Return the humanoid of an MJCF file as a human of 13 links: see above. `bodies.kicking` gives it a ball.
 
-    It stands along z and faces x. names: what the file calls our links, {"left_shin": "calf_l", ...}; those left out
-    are found by usual names. InputError where a link is missing, a joint is no hinge or ball, a geom is
+    It stands along z and faces x. names: those of our links in the file, {"left_shin": "calf_l", ...}; by default
+    usual names are recognised. InputError where a link is missing, a joint is no hinge or ball, a geom is
     neither capsule nor sphere, or bodies are tied by more than joints.
     """
     path = Path(source)
@@ -72,17 +72,17 @@ def humanoid(source: str | Path, names: Mapping[str, str] | None = None, name: s
         raise InputError(
             f"source: {path.name} is no MJCF file that MuJoCo reads: {str(error).splitlines()[0]}"
         ) from None
-    for what, count in (("equality constraints", model.neq), ("tendons", model.ntendon)):
+    for element, count in (("equality constraints", model.neq), ("tendons", model.ntendon)):
         if count:
-            raise InputError(f"source: {path.name} has {count} {what}, but only joints can tie links")
+            raise InputError(f"source: {path.name} has {count} {element}, but only joints can tie links")
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     usual = human(name)
     own = _named(path.name, model, [link.name for link in usual.links], dict(names or {}))
     owners = _owners(path.name, model, own)
-    placed = [_placed(path.name, model, data, owners, link) for link in own]
-    ties = _joints(path.name, model, data, own, usual)
-    return _assembled(usual, placed, ties)
+    geometries = [_geometry(path.name, model, data, owners, link) for link in own]
+    joints = _joints(path.name, model, data, own, usual)
+    return _assembled(usual, geometries, joints)
 
 
 def _named(file: str, model: mujoco.MjModel, links: Sequence[str], names: dict[str, str]) -> dict[str, int]:
@@ -92,11 +92,11 @@ def _named(file: str, model: mujoco.MjModel, links: Sequence[str], names: dict[s
         require_known("names", link, links)
     own = {}
     for link in links:
-        wanted = [names[link]] if link in names else [body for body in bodies if usual_name(body) == link]
-        if len(wanted) != 1 or wanted[0] not in bodies:
-            had = "several bodies" if len(wanted) > 1 else "no body"
-            raise InputError(f"source: {file} has {had} for {link!r}, but needs one; it has {', '.join(bodies)}")
-        own[link] = int(model.body(wanted[0]).id)
+        candidates = [names[link]] if link in names else [body for body in bodies if usual_name(body) == link]
+        if len(candidates) != 1 or candidates[0] not in bodies:
+            number = "several bodies" if len(candidates) > 1 else "no body"
+            raise InputError(f"source: {file} has {number} for {link!r}, but needs one; it has {', '.join(bodies)}")
+        own[link] = int(model.body(candidates[0]).id)
     return own
 
 
@@ -104,12 +104,12 @@ def _owners(file: str, model: mujoco.MjModel, own: Mapping[str, int]) -> dict[in
     """Return the link of ours that each of the file's bodies is, or is fixed to."""
     owners = {body: link for link, body in own.items()}
     for body in range(1, model.nbody):  # parents come first
-        above = int(model.body_parentid[body])
-        if body not in owners and above not in owners:
+        parent = int(model.body_parentid[body])
+        if body not in owners and parent not in owners:
             raise InputError(
                 f"source: {file}: {model.body(body).name!r} is none of a human's links, and on none of them"
             )
-        owners.setdefault(body, owners.get(above, ""))
+        owners.setdefault(body, owners.get(parent, ""))
     return owners
 
 
@@ -124,88 +124,95 @@ def usual_name(body: str) -> str | None:
     return None if segment is None or paired != bool(side) else side + segment
 
 
-def _placed(file: str, model: mujoco.MjModel, data: mujoco.MjData, owners: Mapping[int, str], link: str) -> Placed:
-    """Return the bodies, geoms and joints of a link in the file."""
+def _geometry(
+    file: str, model: mujoco.MjModel, data: mujoco.MjData, owners: Mapping[int, str], link: str
+) -> LinkGeometry:
+    """Return the geoms and the mass of a link in the file."""
     rows = [body for body, owner in owners.items() if owner == link]
     ends, radii = [], []
     for geom in np.flatnonzero(np.isin(model.geom_bodyid, rows)):
         kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
         if kind not in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE):
-            said, body = kind.name.removeprefix("mjGEOM_").lower(), model.body(model.geom_bodyid[geom]).name
-            raise InputError(f"source: {file}: a geom of {body!r} is a {said}, but must be a capsule or a sphere")
+            kind_name, body = kind.name.removeprefix("mjGEOM_").lower(), model.body(model.geom_bodyid[geom]).name
+            raise InputError(f"source: {file}: a geom of {body!r} is a {kind_name}, but must be a capsule or a sphere")
         half = size[1] * data.geom_xmat[geom].reshape(3, 3)[:, 2] * (kind == mujoco.mjtGeom.mjGEOM_CAPSULE)
         ends.append((data.geom_xpos[geom] - half, data.geom_xpos[geom] + half))
         radii.append(size[0])
     if not ends:
         raise InputError(f"source: {file}: {link!r} has no geom, but needs a capsule or a sphere")
-    return Placed(np.array(ends), np.array(radii), float(model.body_mass[rows].sum()))
+    return LinkGeometry(np.array(ends), np.array(radii), float(model.body_mass[rows].sum()))
 
 
 def _joints(
     file: str, model: mujoco.MjModel, data: mujoco.MjData, own: Mapping[str, int], usual: Body
-) -> dict[str, Tie]:
+) -> dict[str, FileJoint]:
     """Return the joint of each of our links, the root apart, with its parent."""
-    named = {body: link for link, body in own.items()}
-    ties: dict[frozenset[str], Tie] = {}
-    for body in named:
-        passed, above = [body], int(model.body_parentid[body])
-        while above and above not in named:
-            passed, above = [*passed, above], int(model.body_parentid[above])
-        if not above:
+    link_of = {body: link for link, body in own.items()}
+    file_joints: dict[frozenset[str], FileJoint] = {}
+    for body in link_of:
+        chain, parent = [body], int(model.body_parentid[body])
+        while parent and parent not in link_of:
+            chain, parent = [*chain, parent], int(model.body_parentid[parent])
+        if not parent:
             continue
-        hinges = np.flatnonzero(np.isin(model.jnt_bodyid, passed))
+        hinges = np.flatnonzero(np.isin(model.jnt_bodyid, chain))
         for hinge in hinges:
             kind = mujoco.mjtJoint(model.jnt_type[hinge])
             if kind not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_BALL):
-                said = kind.name.removeprefix("mjJNT_").lower()
-                raise InputError(f"source: {file}: joint {model.joint(hinge).name!r} is a {said}, but must be a hinge")
+                kind_name = kind.name.removeprefix("mjJNT_").lower()
+                raise InputError(
+                    f"source: {file}: joint {model.joint(hinge).name!r} is a {kind_name}, but must be a hinge"
+                )
         place = data.xanchor[hinges].mean(axis=0) if len(hinges) else data.xpos[body]
-        ties[frozenset((named[body], named[above]))] = Tie(place, not len(hinges))
-    found = {}
+        file_joints[frozenset((link_of[body], link_of[parent]))] = FileJoint(place, not len(hinges))
+    joints = {}
     for link, joint in zip(usual.links[1:], usual.joints, strict=True):
-        parent = usual.links[joint.parent].name
-        if (tie := ties.get(frozenset((link.name, parent)))) is None:
-            raise InputError(f"source: {file} does not tie {link.name!r} to {parent!r}, as a human's are")
-        found[link.name] = tie
-    return found
+        parent_name = usual.links[joint.parent].name
+        if (file_joint := file_joints.get(frozenset((link.name, parent_name)))) is None:
+            raise InputError(f"source: {file} does not tie {link.name!r} to {parent_name!r}, as a human's are")
+        joints[link.name] = file_joint
+    return joints
 
 
-def _assembled(usual: Body, placed: Sequence[Placed], ties: Mapping[str, Tie]) -> Body:
+def _assembled(usual: Body, geometries: Sequence[LinkGeometry], joints: Mapping[str, FileJoint]) -> Body:
     """Return the usual human with links and joints where the file has them, hanging limbs turned down first."""
     below = {
         usual.links[joint.parent].name: link.name for link, joint in zip(usual.links[1:], usual.joints, strict=True)
     }
     links, centres, turns = [], [], []
-    for link, given in zip(usual.links, placed, strict=True):
+    for link, geometry in zip(usual.links, geometries, strict=True):
         turn = Rotation.identity()
         if segment_of(link.name) in HANGING:
-            end = ties[below[link.name]].place if link.name in below else given.ends.mean(axis=(0, 1))
-            turn = Rotation.align_vectors([DOWN], [end - ties[link.name].place])[0]
-        fitted, centre = capsule(link, turn.apply(given.ends.reshape(-1, 3)).reshape(-1, 2, 3), given)
+            end = joints[below[link.name]].place if link.name in below else geometry.ends.mean(axis=(0, 1))
+            turn = Rotation.align_vectors([DOWN], [end - joints[link.name].place])[0]
+        fitted, centre = capsule(link, turn.apply(geometry.ends.reshape(-1, 3)).reshape(-1, 2, 3), geometry)
         links.append(fitted)
         centres.append(turn.inv().apply(centre))
         turns.append(turn)
     sized = usual.sized(np.array([(link.length, link.radius, link.mass) for link in links]))
 
     def anchor(row: int, place: np.ndarray) -> tuple[float, float, float]:
-        return said(links[row], turns[row].apply(place - centres[row]))
+        return dimensionless_anchor(links[row], turns[row].apply(place - centres[row]))
 
-    def tied(child: int, joint: Joint, tie: Tie) -> Joint:
-        held: Vector = (0.0, 0.0, 0.0)
-        motor = replace(joint.motor, lower=held, upper=held) if tie.welded and joint.motor else joint.motor
-        return Joint(joint.parent, anchor(joint.parent, tie.place), anchor(child, tie.place), motor)
+    def fitted_joint(child: int, joint: Joint, file_joint: FileJoint) -> Joint:
+        rest: Vector = (0.0, 0.0, 0.0)
+        motor = replace(joint.motor, lower=rest, upper=rest) if file_joint.welded and joint.motor else joint.motor
+        return Joint(joint.parent, anchor(joint.parent, file_joint.place), anchor(child, file_joint.place), motor)
 
-    joints = (tied(child, *each) for child, each in enumerate(zip(sized.joints, ties.values(), strict=True), start=1))
-    return replace(sized, links=tuple(links), joints=tuple(joints))
+    fitted_joints = (
+        fitted_joint(child, *pair)
+        for child, pair in enumerate(zip(sized.joints, joints.values(), strict=True), start=1)
+    )
+    return replace(sized, links=tuple(links), joints=tuple(fitted_joints))
 
 
-def capsule(link: Link, ends: np.ndarray, given: Placed) -> tuple[Link, np.ndarray]:
+def capsule(link: Link, ends: np.ndarray, geometry: LinkGeometry) -> tuple[Link, np.ndarray]:
     """Return the capsule along a link's axis that is as long and as voluminous as its geoms, and its centre (3,) [m].
 
     ends: (G, 2, 3) of the geoms [m]. Of extent E the volume is pi r^2 E - 2 pi r^3 / 3, and grows with r up to a ball.
     """
     axis = np.array(link.axis)
-    along, radii = ends @ axis, given.radii
+    along, radii = ends @ axis, geometry.radii
     low, high = (along.min(axis=1) - radii).min(), (along.max(axis=1) + radii).max()
     spans = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)
     volumes = np.pi * radii**2 * (spans + 4.0 / 3.0 * radii)
@@ -215,11 +222,13 @@ def capsule(link: Link, ends: np.ndarray, given: Placed) -> tuple[Link, np.ndarr
         radius = brentq(lambda r: np.pi * r**2 * (extent - 2.0 * r / 3.0) - volume, 0.0, radius)
     centre = volumes @ ends.mean(axis=1) / volume
     centre += (0.5 * (low + high) - centre @ axis) * axis
-    return replace(link, length=max(extent - 2.0 * radius, ROUNDEST * radius), radius=radius, mass=given.mass), centre
+    return replace(
+        link, length=max(extent - 2.0 * radius, ROUNDEST * radius), radius=radius, mass=geometry.mass
+    ), centre
 
 
-def said(link: Link, place: np.ndarray) -> tuple[float, float, float]:
-    """Return a place on a link, (3,) from its centre [m], as an anchor; see `scene.Joint`."""
+def dimensionless_anchor(link: Link, place: np.ndarray) -> tuple[float, float, float]:
+    """Return a place on a link, (3,) from its centre [m], as a dimensionless anchor; see `scene.Joint`."""
     axis = np.array(link.axis)
     along = (place @ axis) * axis
     x, y, z = along / (0.5 * link.length) + (place - along) / link.radius

@@ -1,4 +1,4 @@
-"""Names that people mistype: one line that says what was given, what there is, and what was probably meant."""
+"""Checks of names and paths: an error of one line with the name, the options, and the nearest of them."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from pathlib import Path
 from larp_model.errors import InputError
 
 
-def require_known(argument: str, name: str, known: Iterable[str]) -> None:
-    """Refuses a name that is none of the known ones."""
-    names = [str(each) for each in known]
+def require_known(argument: str, name: str, options: Iterable[str]) -> None:
+    """Raise InputError for a name that is none of the options."""
+    names = [str(option) for option in options]
     if name not in names:
         raise InputError(f"{argument} is {name!r}, but must be one of {', '.join(names)}{meant(name, names)}")
 
 
 def require_file(argument: str, path: str | Path) -> None:
-    """Refuses a path at which there is no file."""
+    """Raise InputError for a path without a file."""
     path = Path(path)
     if not path.is_file():
-        beside = [each.name for each in path.parent.iterdir()] if path.parent.is_dir() else []
-        raise InputError(f"{argument} is {str(path)!r}, but no such file exists{meant(path.name, beside)}")
+        siblings = [entry.name for entry in path.parent.iterdir()] if path.parent.is_dir() else []
+        raise InputError(f"{argument} is {str(path)!r}, but no such file exists{meant(path.name, siblings)}")
 
 
 def meant(name: str, names: Iterable[str]) -> str:

@@ -1,4 +1,4 @@
-"""Multi-layer perceptrons with ELU, what normalises their inputs and outputs, and the weights that they hold."""
+"""Multi-layer perceptrons with ELU, the statistics that normalise their inputs and outputs, and their weights."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ class Statistics(NamedTuple):
         return self._replace(spread=jnp.where(self.spread > 1e-5, self.spread, 1.0))
 
     def beside(self, more: int) -> Statistics:
-        """Return the statistics with `more` features added that normalising does not change."""
+        """Return the statistics with `more` features added that normalising leaves unchanged."""
         return Statistics(jnp.concatenate([self.mean, jnp.zeros(more)]), jnp.concatenate([self.spread, jnp.ones(more)]))
 
     def normalise(self, features: Array) -> Array:
         """Return features (*, F) in standard deviations from the mean."""
         return (features - self.mean) / self.spread
 
-    def novelty(self, seen: Statistics) -> Array:
-        """Return the root mean square of features with the statistics `seen`, in standard deviations of these ones."""
-        return jnp.sqrt(jnp.mean((seen.spread**2 + (seen.mean - self.mean) ** 2) / self.spread**2))
+    def novelty(self, data: Statistics) -> Array:
+        """Return the root mean square of features of data with these statistics, in standard deviations of our own."""
+        return jnp.sqrt(jnp.mean((data.spread**2 + (data.mean - self.mean) ** 2) / self.spread**2))
 
     def restore(self, outputs: Array) -> Array:
         """Return outputs (*, F) in their own units."""
@@ -70,7 +70,7 @@ class Weights(NamedTuple):
 class Size:
     """The size of a perceptron: number of dense layers, and width of those before the last.
 
-    skip: residual connections. reach: inputs are held within so many standard deviations.
+    skip: residual connections. reach: inputs are clipped to so many standard deviations.
     """
 
     layers: int
@@ -90,7 +90,7 @@ class Size:
 
 
 class Perceptron(nn.Module):
-    """`layers` dense layers of `width` with ELU between them, the last one giving `outputs` values; see `Size`."""
+    """`layers` dense layers of `width` with ELU between them, the last one of `outputs` values; see `Size`."""
 
     layers: int
     width: int

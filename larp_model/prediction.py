@@ -13,7 +13,7 @@ from larp_model.learned.model import Model
 from larp_model.networks import Weights
 from larp_model.simulator import Simulator
 
-# Steps, to whose multiples rollouts are filled up: one program, then, serves all windows of a kick.
+# Rollouts are padded to multiples of so many steps: then one program serves all windows of a kick.
 PADDED = 64
 
 
@@ -30,15 +30,15 @@ def predict(
     controls, torques = np.pad(controls, rest), np.pad(torques, rest)
     for begin in range(0, len(states), chunk):
         rows = np.minimum(np.arange(begin, begin + chunk), len(states) - 1)
-        start, targets, pushes, sizes = (jnp.asarray(each[rows]) for each in (states, controls, torques, morphology))
-        rolled = _roll(simulator.model, simulator.weights, start, targets, pushes, sizes, jnp.asarray(steps))
-        parts.append(np.asarray(rolled)[:, :steps])
+        inputs = (jnp.asarray(values[rows]) for values in (states, controls, torques, morphology))
+        predicted = _roll(simulator.model, simulator.weights, *inputs, jnp.asarray(steps))
+        parts.append(np.asarray(predicted)[:, :steps])
     return np.concatenate(parts)[: len(states)]
 
 
 @partial(jax.jit, static_argnums=0)
 def _roll(
-    model: Model, weights: Weights, start: Array, targets: Array, pushes: Array, sizes: Array, steps: Array
+    model: Model, weights: Weights, start: Array, targets: Array, torques: Array, sizes: Array, steps: Array
 ) -> Array:
     """Return the rollout, compiled once for all weights of a model."""
-    return Simulator.of(model, weights).rollout(start, targets, torques=pushes, morphology=sizes, steps=steps)
+    return Simulator.of(model, weights).rollout(start, targets, torques=torques, morphology=sizes, steps=steps)

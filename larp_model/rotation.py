@@ -69,7 +69,8 @@ def to_rotation_vector(quaternion: Array) -> Array:
 def integrate(quaternion: Array, rotation_vector: Array) -> Array:
     """Turn orientations (*, 4) by world-frame rotation vectors (*, 3) [rad], keeping them of unit length."""
     turned = multiply(from_rotation_vector(rotation_vector), quaternion)
-    return turned / jnp.linalg.norm(turned, axis=-1, keepdims=True)
+    unit: Array = turned / jnp.linalg.norm(turned, axis=-1, keepdims=True)
+    return unit
 
 
 def heading(quaternion: Array) -> Array:

@@ -1,4 +1,4 @@
-"""JAX as this project runs it: on a device that exists, with a compilation cache that is kept between processes."""
+"""Setup of JAX: a check of its device, and a compilation cache that processes share."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ TOLERANCE = 1_000_000_000
 
 def require_device() -> None:
     """Refuse a JAX_PLATFORMS that names a device which this machine or installation lacks."""
-    asked = jax.config.jax_platforms  # type: ignore[attr-defined]
+    platforms = jax.config.jax_platforms  # type: ignore[attr-defined]
     try:
         jax.devices()
     except (AssertionError, RuntimeError):
-        if not asked:
+        if not platforms:
             raise
         raise InputError(
-            f"JAX_PLATFORMS is {asked!r}, but this machine or installation has no such device; unset it, or take 'cpu'"
+            f"JAX_PLATFORMS is {platforms!r}, but this machine or installation has no such device; "
+            "unset it, or take 'cpu'"
         ) from None
 
 
@@ -42,8 +43,8 @@ def remember_compilations() -> None:
         discard_unreadable(folder)
     except (RuntimeError, OSError):  # RuntimeError: the user has no home
         return
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    jax.config.update("jax_compilation_cache_dir", str(folder))  # type: ignore[no-untyped-call]
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # type: ignore[no-untyped-call]
 
 
 def discard_unreadable(folder: Path) -> None:
@@ -53,13 +54,13 @@ def discard_unreadable(folder: Path) -> None:
     """
     try:
         from jax._src.compilation_cache import decompress_executable
-    except ImportError:  # private, but the only thing that knows JAX's format
+    except ImportError:  # private, but the only reader of JAX's format
         return
     stamp, now = folder / "checked", time.time_ns()
-    checked = stamp.stat().st_mtime_ns if stamp.exists() else 0
+    last_check = stamp.stat().st_mtime_ns if stamp.exists() else 0
     for entry in folder.glob("*-cache"):
         with suppress(FileNotFoundError):  # another process deletes them too
-            if entry.stat().st_mtime_ns < checked - TOLERANCE:
+            if entry.stat().st_mtime_ns < last_check - TOLERANCE:
                 continue
             try:
                 decompress_executable(entry.read_bytes())

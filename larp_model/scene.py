@@ -2,7 +2,7 @@
 
 A `Body` is a tree of capsule links. Every link frame sits at the link's centre of mass, and in the rest pose all
 link frames of a body are parallel, so that a joint target of zero means the rest pose. Nothing here knows JAX or an
-engine: the truth, the learned model, the planner and the viewer all read the same description.
+engine: the ground truth, the learned model, the planner and the viewer all read the same description.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Motor:
             raise InputError(f"motor.lower is {self.lower!r}, but must not exceed motor.upper {self.upper!r}")
 
     def times(self, factor: float) -> Motor:
-        """Return a motor `factor` times as strong, stiff, damped and inert."""
+        """Return a motor of `factor` times the stiffness, damping, torque limit and armature."""
         changed = {name: factor * getattr(self, name) for name in ("stiffness", "damping", "torque_limit", "armature")}
         return replace(self, **changed)
 
@@ -211,7 +211,7 @@ class Body:
                 return index
         raise InputError(f"body {self.name!r} has no link {name!r}; it has {[link.name for link in self.links]}")
 
-    def tied(self, one: str, other: str) -> bool:
+    def adjacent(self, one: str, other: str) -> bool:
         """Return whether two links are the same, or one is the other's parent."""
         near, far = sorted((self.link(one), self.link(other)))
         return near == far or self.joints[far - 1].parent == near
@@ -255,9 +255,9 @@ class Scene:
         names = [body.name for body in self.bodies]
         if not names or len(set(names)) != len(names):
             raise InputError(f"scene.bodies are named {names}, but need one or more different names")
-        met = [tuple(sorted((pair.first, pair.second))) for pair in self.pairs]
-        if len(set(met)) != len(met):
-            raise InputError(f"scene.pairs are of {met}, but two bodies may be named together once")
+        paired_bodies = [tuple(sorted((pair.first, pair.second))) for pair in self.pairs]
+        if len(set(paired_bodies)) != len(paired_bodies):
+            raise InputError(f"scene.pairs are of {paired_bodies}, but two bodies may be named together once")
         for pair in self.pairs:
             for name, links in ((pair.first, pair.first_links), (pair.second, pair.second_links)):
                 if not links or len(set(links)) != len(links):
@@ -265,7 +265,7 @@ class Scene:
                 for link in links:
                     self.body(name).link(link)
             for one, other in product(pair.first_links, pair.second_links):
-                if pair.of_itself and self.body(pair.first).tied(one, other):
+                if pair.of_itself and self.body(pair.first).adjacent(one, other):
                     raise InputError(
                         f"scene.pairs lets {one!r} and {other!r} of {pair.first!r} touch, but they are one link, or "
                         "tied by a joint"
@@ -292,13 +292,14 @@ class Scene:
 
     def _slice(self, name: str, count: Callable[[Body], int]) -> slice:
         start, body = 0, self.body(name)
-        for each in self.bodies[: self.bodies.index(body)]:
-            start += count(each)
+        for earlier in self.bodies[: self.bodies.index(body)]:
+            start += count(earlier)
         return slice(start, start + count(body))
 
     def index(self, body: str, link: str) -> int:
         """Return the row of a link in the state."""
-        return self.rows(body).start + self.body(body).link(link)
+        start: int = self.rows(body).start
+        return start + self.body(body).link(link)
 
     @property
     def links(self) -> tuple[Link, ...]:
@@ -355,4 +356,5 @@ def anchor(point: Vector, length: np.ndarray, radius: np.ndarray, axis: Vector) 
     """Return a joint anchor in its link's frame [m], (*, 3), for links of `length` and `radius` (*,) [m]."""
     direction, offset = np.asarray(axis), np.asarray(point)
     along = offset @ direction * direction
-    return 0.5 * length[..., None] * along + radius[..., None] * (offset - along)
+    place: np.ndarray = 0.5 * length[..., None] * along + radius[..., None] * (offset - along)
+    return place

@@ -1,4 +1,4 @@
-"""LARP: a step is how bodies move and touch, by the model of a scene and its weights; a rollout repeats it.
+"""LARP: a step of a scene by its model and weights, and rollouts of many steps.
 
 After M. Andriluka et al., "Learned neural physics simulation for articulated 3D human pose reconstruction" (2024).
 """
@@ -59,14 +59,14 @@ class Simulator:
 
     @staticmethod
     def of(model: Model, weights: Weights) -> Simulator:
-        """Return the simulator of a model; of humans, that of humans of usual size is given their sizes."""
+        """Return the simulator of a model; the scene's humans share the model of humans of usual size."""
         scene = model.scene
         shared = replace(scene, bodies=tuple(usual(body) for body in scene.bodies))
         return Simulator(model.on(shared), weights, scene, scene.morphology)
 
     @property
     def side_by_side(self) -> int:
-        """Return how many rollouts are cheapest side by side on a CPU."""
+        """Return the number of rollouts side by side at which one takes least time on a CPU."""
         return self.model.side_by_side
 
     @staticmethod
@@ -81,7 +81,7 @@ class Simulator:
 
     @staticmethod
     def of_physics(scene: Scene) -> Simulator:
-        """Return the simulator of any scene with nothing learned."""
+        """Return the simulator of any scene by physics alone."""
         remember_compilations()
         return Simulator.of(ResidualModel(scene), Weights({}, {}, {}))
 
@@ -90,8 +90,8 @@ class Simulator:
         morphology: ArrayLike | None = None,
     ) -> Array:  # fmt: skip
         """Return states (N, L, 13) after one `scene.dt` under controls (N, J, 3) [rad]; see `rollout` for the rest."""
-        given = self._checked(state, control, torque, morphology, ())
-        return given[0] if given[0].shape[0] == 0 else _step(self.model, self.weights, *given)
+        arguments = self._checked(state, control, torque, morphology, ())
+        return arguments[0] if arguments[0].shape[0] == 0 else _step(self.model, self.weights, *arguments)
 
     def rollout(
         self, state: ArrayLike, controls: ArrayLike, torques: ArrayLike | None = None,
@@ -105,13 +105,13 @@ class Simulator:
         the H are computed, the rest repeat the last; all by default. All are taken in the state's precision, 32
         or 64 bits. Positions in 32 bits are 0.1 mm apart 1 km from the origin: plan near it.
         """
-        given = self._checked(state, controls, torques, morphology, np.shape(controls)[1:2])
-        start, targets, *_ = given
+        arguments = self._checked(state, controls, torques, morphology, np.shape(controls)[1:2])
+        start, targets, *_ = arguments
         if start.shape[0] == 0:
             return jnp.zeros((0, targets.shape[1], *start.shape[1:]), start.dtype)
-        states = _rollout(self.model, self.weights, *given, steps=steps)
-        lost = jnp.cumsum(~packed.healthy(states), axis=1) > 0
-        return jnp.where(lost[..., None, None], jnp.nan, states)
+        states = _rollout(self.model, self.weights, *arguments, steps=steps)
+        diverged = jnp.cumsum(~packed.healthy(states), axis=1) > 0
+        return jnp.where(diverged[..., None, None], jnp.nan, states)
 
     def _checked(
         self, state: ArrayLike, control: ArrayLike, torque: ArrayLike | None, morphology: ArrayLike | None,
@@ -123,16 +123,16 @@ class Simulator:
             raise InputError(f"state has shape {start.shape}, but needs (N, {links}, {packed.SIZE})")
         if start.dtype not in (jnp.float32, jnp.float64):
             raise InputError(f"state has numbers of type {start.dtype}, but needs float32 or float64")
-        count, given = start.shape[0], list[Array | None]()  # the count may be a symbol: see `jax.export`
+        count, arrays = start.shape[0], list[Array | None]()  # the count may be a symbol: see `jax.export`
         for name, value, rows in (("controls", control, motors), ("torques", torque, links)):
-            given.append(None if value is None else _array(name, value, start.dtype))
-            if given[-1] is not None and given[-1].shape != (count, *steps, rows, 3):
-                wanted = f"({count}, {'H, ' if steps else ''}{rows}, 3)"
-                raise InputError(f"{name} have shape {given[-1].shape}, but need {wanted}")
+            arrays.append(None if value is None else _array(name, value, start.dtype))
+            if arrays[-1] is not None and arrays[-1].shape != (count, *steps, rows, 3):
+                expected = f"({count}, {'H, ' if steps else ''}{rows}, 3)"
+                raise InputError(f"{name} have shape {arrays[-1].shape}, but need {expected}")
         sizes = _array("morphology", self.morphology[None] if morphology is None else morphology, start.dtype)
         if sizes.shape not in ((1, links, 3), (count, links, 3)):
             raise InputError(f"morphology has shape {sizes.shape}, but needs ({count} or 1, {links}, 3)")
-        controls, torques = given
+        controls, torques = arrays
         assert controls is not None
         return start, controls, torques, sizes
 
@@ -158,11 +158,11 @@ def rollout(
         return step(model, weights, current, control, torque, morphology, stop_gradient)
 
     def next_state(current: Array, inputs: tuple[Array, tuple[Array, Array | None]]) -> tuple[Array, Array]:
-        number, given = inputs
+        number, step_inputs = inputs
         if steps is None:
-            after = advance(current, given)
+            after = advance(current, step_inputs)
         else:
-            after = jax.lax.cond(number < steps, advance, lambda held, _: held, current, given)
+            after = jax.lax.cond(number < steps, advance, lambda unchanged, _: unchanged, current, step_inputs)
         return after, after
 
     by_time = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), (controls, torques))
@@ -170,6 +170,6 @@ def rollout(
     return jnp.moveaxis(states, 0, 1)
 
 
-# Compiled once for each shape, also where nothing around them is; in what JAX traces they leave no mark.
+# Compiled once for each shape where they are called by themselves; inlined where JAX traces their caller.
 _step = jax.jit(step, static_argnums=0, inline=True)
 _rollout = jax.jit(rollout, static_argnums=0, inline=True)

@@ -47,12 +47,12 @@ def pack(position: Array, orientation: Array, velocity: Array, angular_velocity:
 
 
 def healthy(state: Any) -> Any:
-    """Return (*,) whether all links of states (*, L, 13), of NumPy or JAX, are finite and within `LIMITS`."""
+    """Return a mask (*,) of states (*, L, 13), of NumPy or JAX, whose links are all finite and within `LIMITS`."""
     xp = state.__array_namespace__()
-    found = xp.all(xp.isfinite(state), axis=(-2, -1))
+    result = xp.all(xp.isfinite(state), axis=(-2, -1))
     for columns, limit in LIMITS:
-        found = found & xp.all(xp.abs(state[..., columns]) < limit, axis=(-2, -1))
-    return found
+        result = result & xp.all(xp.abs(state[..., columns]) < limit, axis=(-2, -1))
+    return result
 
 
 class Trajectories(Protocol):

@@ -1,4 +1,4 @@
-"""Training, which goes on if cut off: residual networks on single steps, others by the paper's Algorithm 1."""
+"""Training, resumed after an interruption: residual networks on single steps, others by the paper's Algorithm 1."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from larp_model.state import Trajectories
 
 # Errors of residual networks beyond this, in standard deviations, count linearly.
 LARGE = 0.1
-# Updates by which it is judged how many fit into a time.
+# Updates whose time tells how many fit into the time of a training.
 TIMED = 20
 
 
@@ -77,8 +77,8 @@ class Recipe:
         return self.curriculum[-1][0]
 
 
-class Progressed(NamedTuple):
-    """The state of training, which a checkpoint holds."""
+class TrainingState(NamedTuple):
+    """State of training in a checkpoint: networks, the optimiser's state, and number of updates done."""
 
     networks: dict[str, Any]
     optimiser: Any
@@ -95,7 +95,7 @@ class Batch(NamedTuple):
 
 
 class Windows:
-    """Draws training windows from sources of trajectories, each source with its share."""
+    """Training windows, drawn from sources of trajectories by their shares."""
 
     def __init__(self, scene: Scene, sources: Sequence[tuple[Trajectories, float]], recipe: Recipe) -> None:
         self.sources, self.recipe = [source for source, _ in sources], recipe
@@ -109,16 +109,18 @@ class Windows:
         parts = []
         for source, contacts, count in zip(self.sources, self.contacts, counts, strict=True):
             last = source.controls.shape[1] - steps
-            # A contact so late that its windows would have to start earlier than asked for is left out.
+            # A contact so late that its windows would have to start more than `before_contact` earlier is left out.
             struck = np.flatnonzero((contacts >= 0) & (contacts - self.recipe.before_contact <= last))
-            near = min(round(self.recipe.contact_share * count), count if len(struck) else 0)
-            anywhere = random.integers(len(contacts), size=count - near)
-            chosen = np.concatenate([struck[random.integers(len(struck), size=near)] if near else struck[:0], anywhere])
+            near_contact = min(round(self.recipe.contact_share * count), count if len(struck) else 0)
+            anywhere = random.integers(len(contacts), size=count - near_contact)
+            chosen = np.concatenate(
+                [struck[random.integers(len(struck), size=near_contact)] if near_contact else struck[:0], anywhere]
+            )
             if last < 0:
                 raise InputError(f"episodes have {source.controls.shape[1]} steps, but the unroll needs {steps}")
             start = random.integers(last + 1, size=count)
-            back = random.integers(self.recipe.before_contact + 1, size=near)
-            start[:near] = np.clip(contacts[chosen[:near]] - back, 0, last)
+            back = random.integers(self.recipe.before_contact + 1, size=near_contact)
+            start[:near_contact] = np.clip(contacts[chosen[:near_contact]] - back, 0, last)
             columns = start[:, None] + np.arange(steps + 1)
             rows = chosen[:, None]
             parts.append(
@@ -133,15 +135,15 @@ class Windows:
 
 
 def statistics_of(model: Model, windows: Windows, random: np.random.Generator, batches: int = 32) -> Weights:
-    """Return fresh weights, their statistics measured on single true steps drawn as in training."""
+    """Return initial weights, with statistics of single steps of the ground truth, drawn as in training."""
     drawn = [windows.draw(random, 2) for _ in range(batches)]
     states, controls, torques, morphology = (np.concatenate(column) for column in zip(*drawn, strict=True))
     turns = rotation.random_turns(jax.random.key(int(random.integers(2**31))), len(states))
     if not model.invariant:
         states = np.asarray(rotation.turn_states(jnp.asarray(states), turns[:, None]))
     step = states[:, 0], states[:, 1], controls[:, 0], torques[:, 0], morphology
-    found = jax.jit(model.measure)(*step)
-    return initial_weights(model, jax.random.key(int(random.integers(2**31))), found)
+    statistics = jax.jit(model.measure)(*step)
+    return initial_weights(model, jax.random.key(int(random.integers(2**31))), statistics)
 
 
 def emphasis(scene: Scene, recipe: Recipe) -> Array:
@@ -151,7 +153,7 @@ def emphasis(scene: Scene, recipe: Recipe) -> Array:
 
 
 def optimiser(recipe: Recipe) -> optax.GradientTransformation:
-    """Return Adam behind a clipped gradient norm; its changes are still to be multiplied by a rate."""
+    """Return Adam behind a clipped gradient norm; its changes have to be multiplied by a learning rate."""
     return optax.chain(optax.clip_by_global_norm(recipe.clip), optax.scale_by_adam())
 
 
@@ -165,26 +167,26 @@ def learning_rate(recipe: Recipe, update: int) -> float:
 
 
 Update = Callable[[dict[str, Any], Any, Array, Any, float | Array], tuple[dict[str, Any], Any, dict[str, Array]]]
-"""(networks, the optimiser's state, key, `Batch`, learning rate) -> both anew, and losses and norms by name."""
+"""(networks, the optimiser's state, key, `Batch`, learning rate) -> (networks, state, losses and norms by name)."""
 
 
 def update_of(model: Model, recipe: Recipe, weights: Weights) -> Update:
     """Return one step of gradient descent as a pure function; see `Update`.
 
-    Of `weights` the statistics count. A batch whose gradient is not finite, or beyond `recipe.drop`, changes nothing.
+    Only the statistics of `weights` are used. A batch is dropped if its gradient is not finite, or beyond `recipe.drop`.
     """
     scene, transform = model.scene, optimiser(recipe)
-    weigh = emphasis(scene, recipe)
+    link_weights = emphasis(scene, recipe)
 
     def loss_of(networks: dict[str, Any], states: Array, drawn: Any) -> tuple[Array, dict[str, Array]]:
-        whole = weights._replace(networks=networks)
+        all_weights = weights._replace(networks=networks)
         if isinstance(model, ResidualModel):
-            return step_loss(model, whole, states, drawn)
+            return step_loss(model, all_weights, states, drawn)
         predicted = rollout(
-            model, whole, states[:, 0], drawn.controls, drawn.torques, drawn.morphology,
+            model, all_weights, states[:, 0], drawn.controls, drawn.torques, drawn.morphology,
             stop_gradient=recipe.stop_gradient,
         )  # fmt: skip
-        return losses.total(scene, recipe.loss, weigh, predicted, states[:, 1:], drawn.morphology)
+        return losses.total(scene, recipe.loss, link_weights, predicted, states[:, 1:], drawn.morphology)
 
     def update(
         networks: dict[str, Any], state: Any, key: Array, drawn: Any, rate: float | Array
@@ -196,37 +198,69 @@ def update_of(model: Model, recipe: Recipe, weights: Weights) -> Update:
             drawn = drawn._replace(torques=rotation.about_z(drawn.torques, turn[:, None, None]))
         (loss, terms), gradient = jax.value_and_grad(loss_of, has_aux=True)(networks, states, drawn)
         norm = optax.tree.norm(gradient)
-        good = jnp.isfinite(norm) & (norm < recipe.drop)
-        gradient = jax.tree.map(lambda g: jnp.where(good, g, 0.0), gradient)
+        accepted = jnp.isfinite(norm) & (norm < recipe.drop)
+        gradient = jax.tree.map(lambda g: jnp.where(accepted, g, 0.0), gradient)
         changes, new_state = transform.update(gradient, state, networks)
         changes = jax.tree.map(lambda change: -rate * change, changes)
-        keep = partial(jax.tree.map, lambda new, old: jnp.where(good, new, old))
+        keep = partial(jax.tree.map, lambda new, old: jnp.where(accepted, new, old))
         return (
             keep(optax.apply_updates(networks, changes), networks),
             keep(new_state, state),
-            terms | {"loss": loss, "norm": norm, "dropped": 1.0 - good},
+            terms | {"loss": loss, "norm": norm, "dropped": 1.0 - accepted},
         )
 
     return update
 
 
 def step_loss(model: ResidualModel, weights: Weights, states: Array, drawn: Any) -> tuple[Array, dict[str, Array]]:
-    """Return how far networks are from what physics lacks in the first steps of windows (B, T + 1, L, 13).
+    """Return the loss of residual networks in the first steps of windows (B, T + 1, L, 13).
 
-    In standard deviations; beyond `LARGE` errors count linearly. Steps in which links of two bodies touch are left
-    out. Physics is asked once, and not differentiated.
+    Errors are in standard deviations of the outputs; beyond `LARGE` they count linearly. Steps in which links of two
+    bodies touch are left out. Physics is evaluated once, and not differentiated.
     """
     before, after = states[:, 0], states[:, 1]
-    apart = jnp.ones(len(states))
+    separate = jnp.ones(len(states))
     for _, points in contact_points(model.scene, before, drawn.morphology, after):
-        apart *= 1.0 - jnp.max(points.near, axis=1)
-    apart /= jnp.maximum(jnp.sum(apart), 1.0)
+        separate *= 1.0 - jnp.max(points.near, axis=1)
+    separate /= jnp.maximum(jnp.sum(separate), 1.0)
     loss = jnp.zeros(())
-    given = drawn.controls[:, 0], drawn.torques[:, 0], drawn.morphology
-    for name, inputs, outputs in model.examples(before, after, *given):
+    arguments = drawn.controls[:, 0], drawn.torques[:, 0], drawn.morphology
+    for name, inputs, outputs in model.examples(before, after, *arguments):
         error = model.answer(weights, name, inputs) - weights.outputs[name].normalise(outputs)
-        loss += jnp.sum(apart * jnp.mean(losses.pseudo_huber(error**2, LARGE), axis=1))
+        loss += jnp.sum(separate * jnp.mean(losses.pseudo_huber(error**2, LARGE), axis=1))
     return loss, {}
+
+
+class TrainingLog:
+    """Loss, norms and drops of a run: means of updates, for `train`'s log, a file and TensorBoard."""
+
+    def __init__(self, folder: Path, first: int, batch: int) -> None:
+        """Begin to log updates from number `first` on, of so many sequences each."""
+        self.content: dict[str, Any] = {"history": [], "dropped": 0, "stopped_early": False, "seconds": 0.0}
+        self.folder, self.first, self.batch, self.begin = folder, first, batch, time.perf_counter()
+        self.recent: list[dict[str, float]] = []
+        self.dropped_in_a_row = 0
+
+    def add(self, terms: dict[str, Array]) -> None:
+        """Add the losses and norms of an update."""
+        values = {name: float(value) for name, value in terms.items()}
+        self.recent.append(values)
+        self.content["dropped"] += int(values["dropped"])
+        self.dropped_in_a_row = self.dropped_in_a_row + 1 if values["dropped"] else 0
+
+    def write(self, board: Any, updates: int, unroll: int, now: float) -> str:
+        """Write the means since the last call, after so many updates; return them as a note for the progress bar."""
+        finite = [row for row in self.recent if np.isfinite(row["loss"])] or self.recent
+        mean = {name: float(np.mean([row[name] for row in finite])) for name in self.recent[-1]}
+        rate = (updates - self.first) * self.batch / (now - self.begin)
+        row = {"update": updates, "unroll": unroll, **mean, "sequences_per_second": rate}
+        self.content["history"].append(row)
+        with (self.folder / "history.jsonl").open("a") as file:
+            file.write(json.dumps(row) + "\n")
+        for name, value in row.items():
+            board.add_scalar(name, value, updates)
+        self.recent = []
+        return f"loss {mean['loss']:.3g}, {rate:.0f} sequences/s"
 
 
 def train(
@@ -238,10 +272,10 @@ def train(
     quiet: bool = False,
     seconds: float = math.inf,
 ) -> tuple[Weights, dict[str, Any]]:
-    """Train on sources of (trajectories, share); returns the weights and a log of loss, norms and drops.
+    """Train on sources of (trajectories, share); return the weights and a log of loss, norms and drops.
 
-    folder: where checkpoints are kept, and logs for TensorBoard; a run cut off there goes on from its last. start:
-    weights to go on from; fresh ones by default. seconds: only as many of the updates as fit into them, judged by
+    folder: of checkpoints, from the last of which an interrupted run is resumed, and of logs for TensorBoard. start:
+    weights to continue from; initial ones by default. seconds: only as many of the updates as fit into them, judged by
     the first. Where a hundred batches in a row are dropped, the last good weights are returned and the log says so.
     """
     from tensorboardX import SummaryWriter  # whose import sets a variable of the environment
@@ -249,66 +283,58 @@ def train(
     random = np.random.default_rng(recipe.seed)
     windows = Windows(model.scene, sources, recipe)
     weights = start or statistics_of(model, windows, random)
-    progressed = Progressed(weights.networks, optimiser(recipe).init(weights.networks), 0)
     manager = ocp.CheckpointManager(
         (folder / "checkpoints").absolute(), options=ocp.CheckpointManagerOptions(max_to_keep=1, create=True)
     )
-    if manager.latest_step() is not None:
-        restored = manager.restore(manager.latest_step(), args=ocp.args.StandardRestore((progressed, weights[1:])))
-        progressed, statistics = Progressed(*restored[0]), restored[1]
-        weights = Weights(progressed.networks, *statistics)
+    training, weights = _restored(manager, recipe, weights)
     update = jax.jit(update_of(model, recipe, weights), donate_argnums=(0, 1))
-
-    log: dict[str, Any] = {"history": [], "dropped": 0, "stopped_early": False, "seconds": 0.0}
-    in_a_row, recent, begin, saved = 0, [], time.perf_counter(), time.perf_counter()
-    networks, state = jax.tree.map(jnp.copy, progressed.networks), progressed.optimiser  # `update` consumes them
-    first = int(progressed.update)
-    columns = (
-        TextColumn("training"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-        TextColumn("{task.fields[note]}"), TimeRemainingColumn(),
-    )  # fmt: skip
+    index = first = int(training.update)
+    log, saved = TrainingLog(folder, first, recipe.batch), time.perf_counter()
+    networks, state = jax.tree.map(jnp.copy, training.networks), training.optimiser  # `update` consumes them
     # A checkpoint is written beside training: closing the manager, however training ends, waits for the last.
     board_folder = str(folder / "tensorboard")
-    with closing(manager), Progress(*columns, disable=quiet) as bar, SummaryWriter(board_folder) as board:
+    with closing(manager), _progress_bar(quiet) as bar, SummaryWriter(board_folder) as board:
         task = bar.add_task("", total=recipe.updates, completed=first, note="")
-        index = first
         while index < recipe.updates:
             drawn = windows.draw(np.random.default_rng((recipe.seed, index)), recipe.unroll(index))
             key = jax.random.fold_in(jax.random.key(recipe.seed), index)
             networks, state, terms = update(networks, state, key, drawn, learning_rate(recipe, index))
-            values = {name: float(value) for name, value in terms.items()}
-            recent.append(values)
-            log["dropped"] += int(values["dropped"])
-            in_a_row = in_a_row + 1 if values["dropped"] else 0
+            log.add(terms)
             if (index + 1) % 100 == 0 or index + 1 == recipe.updates:
                 now = time.perf_counter()
-                sound = [row for row in recent if np.isfinite(row["loss"])] or recent
-                mean = {name: float(np.mean([row[name] for row in sound])) for name in values}
-                rate = (index + 1 - first) * recipe.batch / (now - begin)
-                log["history"].append(
-                    {"update": index + 1, "unroll": recipe.unroll(index), **mean, "sequences_per_second": rate}
-                )
-                note = f"loss {mean['loss']:.3g}, {rate:.0f} sequences/s"
-                bar.update(task, completed=index + 1, note=note)
-                with (folder / "history.jsonl").open("a") as file:
-                    file.write(json.dumps(log["history"][-1]) + "\n")
-                for name, value in log["history"][-1].items():
-                    board.add_scalar(name, value, index + 1)
-                recent = []
+                bar.update(task, completed=index + 1, note=log.write(board, index + 1, recipe.unroll(index), now))
                 if now - saved > 60 or index + 1 == recipe.updates:
-                    content = (Progressed(networks, state, index + 1), weights[1:])
+                    content = (TrainingState(networks, state, index + 1), weights[1:])
                     manager.save(index + 1, args=ocp.args.StandardSave(content))
                     saved = now
-            if in_a_row >= 100:
-                log["stopped_early"] = True
+            if log.dropped_in_a_row >= 100:
+                log.content["stopped_early"] = True
                 break
             index += 1
             if index == first + 1:
                 compiled = time.perf_counter()
             elif index == first + TIMED and math.isfinite(seconds):
                 now = time.perf_counter()
-                left = (seconds - (now - begin)) / ((now - compiled) / (TIMED - 1))
+                left = (seconds - (now - log.begin)) / ((now - compiled) / (TIMED - 1))
                 recipe = replace(recipe, updates=min(recipe.updates, index + max(1, int(left))))
                 bar.update(task, total=recipe.updates)
-    log["seconds"] = time.perf_counter() - begin
-    return weights._replace(networks=networks), log
+    log.content["seconds"] = time.perf_counter() - log.begin
+    return weights._replace(networks=networks), log.content
+
+
+def _restored(manager: Any, recipe: Recipe, weights: Weights) -> tuple[TrainingState, Weights]:
+    """Return the state of training in the last checkpoint with its weights; that of no update where there is none."""
+    training = TrainingState(weights.networks, optimiser(recipe).init(weights.networks), 0)
+    if manager.latest_step() is None:
+        return training, weights
+    restored = manager.restore(manager.latest_step(), args=ocp.args.StandardRestore((training, weights[1:])))
+    training = TrainingState(*restored[0])
+    return training, Weights(training.networks, *restored[1])
+
+
+def _progress_bar(quiet: bool) -> Progress:
+    columns = (
+        TextColumn("training"), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TextColumn("{task.fields[note]}"), TimeRemainingColumn(),
+    )  # fmt: skip
+    return Progress(*columns, disable=quiet)

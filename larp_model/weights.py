@@ -1,4 +1,4 @@
-"""Weights on disk: tensors as safetensors, and a manifest that says of which model they are and how they came to be."""
+"""Weights on disk: tensors as safetensors, and a manifest that describes their model and their training."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from larp_model.physics.motion import Constants
 from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface
 
 VERSION = 4
-# Motors may be so much stronger or weaker than those of the training where physics is what says what they do.
-MOTORS = 0.2
-# What a manifest may speak of, by the name that it gives it.
+# Where physics computes motors, their scale may differ by this share from that of the training.
+MOTOR_SCALE_SLACK = 0.2
+# Types that a manifest may contain, by their names in it.
 KINDS: dict[str, Any] = {
     "body": Body,
     "contact settings": ContactSettings,
@@ -51,55 +51,58 @@ TRAIN = "train some with `python -m tasks.train --scene NAME`, or FILE.py:NAME f
 
 
 class Trained(NamedTuple):
-    """The sizes of links that a body's network has learned from, by rows of (length, radius, mass), (n, 3) each."""
+    """Smallest and largest links in the training data of a body's network: length, radius, mass, (n, 3) each."""
 
     lowest: np.ndarray
     highest: np.ndarray
 
 
 def trained_on(scene: Scene, morphology: np.ndarray) -> dict[str, Trained]:
-    """Return what episodes of a morphology (E, L, 3) teach of every kind of body."""
-    found: dict[str, list[np.ndarray]] = {}
+    """Return the smallest and largest links of every kind of body in morphologies (E, L, 3) of episodes."""
+    sizes_by_kind: dict[str, list[np.ndarray]] = {}
     for body in scene.bodies:
-        found.setdefault(body.kind, []).append(morphology[:, scene.rows(body.name)])
+        sizes_by_kind.setdefault(body.kind, []).append(morphology[:, scene.rows(body.name)])
     return {
         kind: Trained(np.concatenate(sizes).min(axis=0), np.concatenate(sizes).max(axis=0))
-        for kind, sizes in found.items()
+        for kind, sizes in sizes_by_kind.items()
     }
 
 
 def encode(value: Any) -> Any:
-    """Return a model, and all that it is made of, as JSON holds it."""
+    """Return a model and all its parts in types of JSON."""
     if dataclasses.is_dataclass(value):
         fields = {field.name: encode(getattr(value, field.name)) for field in dataclasses.fields(value)}
         return {"type": NAMES[type(value)], **fields}
-    return [encode(each) for each in value] if isinstance(value, tuple) else value
+    return [encode(item) for item in value] if isinstance(value, tuple) else value
 
 
 def decode(value: Any) -> Any:
-    """Return what `encode` made this of; every field is required."""
+    """Return the inverse of `encode`; every field is required."""
     if isinstance(value, dict):
         kind = KINDS[value["type"]]
-        given, needed = set(value) - {"type"}, {field.name for field in dataclasses.fields(kind)}
-        if given != needed:
-            raise ValueError(f"{value['type']} has the fields {sorted(given)}, but needs {sorted(needed)}")
+        present, needed = set(value) - {"type"}, {field.name for field in dataclasses.fields(kind)}
+        if present != needed:
+            raise ValueError(f"{value['type']} has the fields {sorted(present)}, but needs {sorted(needed)}")
         return kind(**{name: decode(value[name]) for name in needed})
-    return tuple(decode(each) for each in value) if isinstance(value, list) else value
+    return tuple(decode(item) for item in value) if isinstance(value, list) else value
 
 
 def flatten(weights: Weights) -> dict[str, Any]:
     """Return weights as named arrays."""
     tree = weights._asdict()
     for group in ("inputs", "outputs"):
-        tree[group] = {name: each._asdict() for name, each in tree[group].items()}
-    return dict(flatten_dict(tree, sep=":"))
+        tree[group] = {name: statistics._asdict() for name, statistics in tree[group].items()}
+    return dict(flatten_dict(tree, sep=":"))  # type: ignore[no-untyped-call]
 
 
 def unflatten(arrays: Mapping[str, np.ndarray]) -> Weights:
     """Return weights from named arrays."""
-    tree = unflatten_dict({name: jnp.asarray(array) for name, array in arrays.items()}, sep=":")
-    seen = ({name: Statistics(**each) for name, each in tree.get(group, {}).items()} for group in ("inputs", "outputs"))
-    return Weights(tree.get("networks", {}), *seen)
+    tensors = {name: jnp.asarray(array) for name, array in arrays.items()}
+    tree = unflatten_dict(tensors, sep=":")  # type: ignore[no-untyped-call]
+    statistics = (
+        {name: Statistics(**fields) for name, fields in tree.get(group, {}).items()} for group in ("inputs", "outputs")
+    )
+    return Weights(tree.get("networks", {}), *statistics)
 
 
 def save(
@@ -115,8 +118,8 @@ def save(
     tensors = serialise(arrays)
     sizes = np.asarray(model.scene.morphology[None] if morphology is None else morphology, np.float64)
     trained = {
-        kind: {name: np.round(each, 6).tolist() for name, each in found._asdict().items()}
-        for kind, found in trained_on(model.scene, sizes).items()
+        kind: {name: np.round(values, 6).tolist() for name, values in extremes_of_kind._asdict().items()}
+        for kind, extremes_of_kind in trained_on(model.scene, sizes).items()
     }
     manifest = {"version": VERSION, "model": encode(model), "trained on": trained, "recipe": recipe}
     manifest["sha256"] = digest(manifest, tensors)
@@ -128,14 +131,14 @@ def save(
 
 def digest(manifest: Mapping[str, Any], tensors: bytes) -> str:
     """Return the sha256 of a manifest, that hash apart, and its tensors."""
-    content = json.dumps({name: each for name, each in manifest.items() if name != "sha256"}, sort_keys=True)
+    content = json.dumps({name: value for name, value in manifest.items() if name != "sha256"}, sort_keys=True)
     return hashlib.sha256(content.encode() + tensors).hexdigest()
 
 
 def load(manifest: Path, scene: Scene | None = None) -> tuple[Model, Weights, dict[str, Any]]:
     """Return the scene's model, its weights and the whole manifest; refuse what is missing, damaged or does not fit.
 
-    scene: None for that which they were trained on.
+    scene: that of the training by default.
     """
     tensors_path = manifest.with_suffix(".safetensors")
     for path in (manifest, tensors_path):
@@ -143,9 +146,9 @@ def load(manifest: Path, scene: Scene | None = None) -> tuple[Model, Weights, di
     try:
         content = dict(json.loads(manifest.read_text()))
         version, expected = content["version"], content["sha256"]
-        known = version == VERSION
-        trained_model = decode(content["model"]) if known else None
-        trained = trained_sizes(content) if known else {}
+        is_current = version == VERSION
+        trained_model = decode(content["model"]) if is_current else None
+        trained = trained_sizes(content) if is_current else {}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"weights manifest {manifest} cannot be read: {type(error).__name__}: {error}") from None
     if trained_model is None:
@@ -156,64 +159,68 @@ def load(manifest: Path, scene: Scene | None = None) -> tuple[Model, Weights, di
             f"weights file {tensors_path} or {manifest.name} is damaged: their sha256 is not the one given"
         )
     model = trained_model if scene is None else trained_model.on(scene)
-    wanted, networks = model.networks(), trained_model.networks()
-    for name in wanted.keys() - networks.keys():
+    needed, networks = model.networks(), trained_model.networks()
+    for name in needed.keys() - networks.keys():
         names = ", ".join(networks) or "none"
         raise InputError(f"weights {manifest}: there is no network {name!r} for this scene, but {names}; {TRAIN}")
     for difference in differences(trained_model, model, trained):
         raise InputError(f"weights {manifest} do not fit the scene: {difference}")
-    arrays = {name: array for name, array in parse(raw).items() if name.split(":")[1] in wanted}
+    arrays = {name: array for name, array in parse(raw).items() if name.split(":")[1] in needed}
     _check_shapes(tensors_path, arrays, shapes(model))
     return model, unflatten(arrays), content
 
 
 def differences(trained_model: Model, model: Model, trained: Mapping[str, Trained]) -> Iterator[str]:
-    """Yield in what a model's scene is not what networks were trained for, where it needs them, in a few words each."""
+    """Yield the differences of a model's scene from that of the training that affect networks, in a few words."""
     names = model.networks()
     if not names:
         return  # physics alone, of any scene
-    was, now = trained_model.scene, model.scene
+    trained_scene, scene = trained_model.scene, model.scene
     for name in ("dt", "gravity"):
-        yield from _differ(f"its {name}", getattr(now, name), getattr(was, name))
+        yield from _differ(f"its {name}", getattr(scene, name), getattr(trained_scene, name))
     physical = isinstance(model, ResidualModel)
-    for body in now.bodies:
-        own = next((each for each in was.bodies if each.kind == body.kind), None)
-        if own is not None and f"dynamics/{body.kind}" in names:
-            yield from _bodies_differ(body, own, trained[own.kind], MOTORS if physical else 0.0)
+    for body in scene.bodies:
+        trained_body = next((candidate for candidate in trained_scene.bodies if candidate.kind == body.kind), None)
+        if trained_body is not None and f"dynamics/{body.kind}" in names:
+            yield from _bodies_differ(
+                body, trained_body, trained[trained_body.kind], MOTOR_SCALE_SLACK if physical else 0.0
+            )
     if physical:
         return
-    learned = {(one.kind, other.kind): pair for pair, (one, other) in pairs_by_kind(was)}
-    for pair, (one, other) in pairs_by_kind(now):
-        before = learned[one.kind, other.kind]
+    trained_pairs = {(one.kind, other.kind): pair for pair, (one, other) in pairs_by_kind(trained_scene)}
+    for pair, (one, other) in pairs_by_kind(scene):
+        trained_pair = trained_pairs[one.kind, other.kind]
         for owner, beside, name in ((one, other, "first_links"), (other, one, "second_links")):
             yield from _differ(
-                f"what {beside.name} can touch of {owner.name}", getattr(pair, name), getattr(before, name)
+                f"what {beside.name} can touch of {owner.name}", getattr(pair, name), getattr(trained_pair, name)
             )
-        yield from _differ(f"the surface of {one.name} and {other.name}", pair.surface, before.surface)
+        yield from _differ(f"the surface of {one.name} and {other.name}", pair.surface, trained_pair.surface)
 
 
-def _bodies_differ(body: Body, own: Body, trained: Trained, slack: float) -> Iterator[str]:
-    """Yield differences; links' sizes may be any between those trained on, motors of another strength by a share."""
-    yield from _differ(f"{body.name}.links", len(body.links), len(own.links))
-    for link, was in zip(body.links, own.links, strict=True):
-        yield from _differ(f"{body.name}.{link.name}.axis", link.axis, was.axis)
-        yield from _differ(f"the name of {body.name}.{link.name}", link.name, was.name)
+def _bodies_differ(body: Body, trained_body: Body, trained: Trained, slack: float) -> Iterator[str]:
+    """Yield differences of a body; links may have any size between those trained on, motors a scale within `slack`."""
+    yield from _differ(f"{body.name}.links", len(body.links), len(trained_body.links))
+    for link, trained_link in zip(body.links, trained_body.links, strict=True):
+        yield from _differ(f"{body.name}.{link.name}.axis", link.axis, trained_link.axis)
+        yield from _differ(f"the name of {body.name}.{link.name}", link.name, trained_link.name)
     yield from beyond(body, trained)
-    for joint, before, link in zip(body.joints, own.sized(body.sizes).joints, body.links[1:], strict=True):
-        if joint.motor and before.motor and _as_strong(joint.motor, before.motor, slack):
-            joint = dataclasses.replace(joint, motor=before.motor)
-        yield from _differ(f"the joint of {body.name}.{link.name}", joint, before)
-    yield from _differ(f"{body.name}.surface", body.surface, own.surface)
+    for joint, trained_joint, link in zip(
+        body.joints, trained_body.sized(body.sizes).joints, body.links[1:], strict=True
+    ):
+        if joint.motor and trained_joint.motor and _is_scaled(joint.motor, trained_joint.motor, slack):
+            joint = dataclasses.replace(joint, motor=trained_joint.motor)
+        yield from _differ(f"the joint of {body.name}.{link.name}", joint, trained_joint)
+    yield from _differ(f"{body.name}.surface", body.surface, trained_body.surface)
 
 
-def _as_strong(motor: Motor, was: Motor, slack: float) -> bool:
-    """Return whether a motor is `Motor.times` of another by at most that share more or less."""
-    factor = motor.stiffness / was.stiffness
-    return abs(factor - 1.0) <= slack + 1e-6 and not list(_differ("", motor, was.times(factor)))
+def _is_scaled(motor: Motor, trained: Motor, slack: float) -> bool:
+    """Return whether a motor is `Motor.times` of the trained one, by a factor within `slack` of 1."""
+    factor = motor.stiffness / trained.stiffness
+    return abs(factor - 1.0) <= slack + 1e-6 and not list(_differ("", motor, trained.times(factor)))
 
 
 def beyond(body: Body, trained: Trained) -> Iterator[str]:
-    """Yield which sizes of a body's links are none that its network has learned from, in a few words each."""
+    """Yield the sizes of a body's links that are outside its network's training data, in a few words each."""
     for link, lowest, highest in zip(body.links, *trained, strict=True):
         for name, low, high in zip(("length", "radius", "mass"), lowest, highest, strict=True):
             value = getattr(link, name)
@@ -231,15 +238,15 @@ def trained_sizes(content: Mapping[str, Any]) -> dict[str, Trained]:
 
 
 def extremes(content: Mapping[str, Any], scene: Scene) -> np.ndarray:
-    """Return morphologies (2, L, 3) of a scene: the smallest and the largest links that a manifest's weights know."""
-    known = trained_sizes(content)
+    """Return morphologies (2, L, 3) of a scene: the smallest and the largest links of a manifest's training data."""
+    trained = trained_sizes(content)
     return np.stack(
-        [np.concatenate([getattr(known[body.kind], end) for body in scene.bodies]) for end in Trained._fields]
+        [np.concatenate([getattr(trained[body.kind], end) for body in scene.bodies]) for end in Trained._fields]
     )
 
 
 def _differ(what: str, now: Any, was: Any) -> Iterator[str]:
-    """Yield the fields in which two things differ, or the things where they have none; rounding apart."""
+    """Yield the fields in which two values differ, or the values where they have no fields; rounding apart."""
     if now == was or (isinstance(now, float) and math.isclose(now, was, rel_tol=1e-5)):
         return
     if dataclasses.is_dataclass(now) and dataclasses.is_dataclass(was):
@@ -256,9 +263,9 @@ def shapes(model: Model) -> dict[str, tuple[int, ...]]:
 
 def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray], needed: Mapping[str, tuple[int, ...]]) -> None:
     if set(arrays) != set(needed):
-        odd = sorted(set(arrays) ^ set(needed))
-        raise InputError(f"weights file {path} and its manifest differ in the tensors {odd}")
+        unmatched = sorted(set(arrays) ^ set(needed))
+        raise InputError(f"weights file {path} and its manifest differ in the tensors {unmatched}")
     for name, shape in needed.items():
-        found = arrays[name].shape
-        if found != shape:
-            raise InputError(f"weights file {path}: {name} has shape {found}, but its model needs {shape}")
+        actual = arrays[name].shape
+        if actual != shape:
+            raise InputError(f"weights file {path}: {name} has shape {actual}, but its model needs {shape}")

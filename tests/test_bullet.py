@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
 from larp_model.bodies import ball, capsule, chain, human
-from larp_model.engines.bullet import BulletTruth, give, inertia
+from larp_model.engines.bullet import BulletTruth, compliance, inertia
 from larp_model.engines.mujoco import Truth, compile_model
 from larp_model.errors import InputError
 from larp_model.scene import Body, Joint, Link, Motor, Pair, Scene, Surface
@@ -103,7 +103,7 @@ def test_moments_of_inertia_are_those_of_mujoco() -> None:
 @pytest.mark.parametrize("surface", [ball().surface, human().surface, Surface(100.0, 0.0, 1.0)])
 def test_implicit_steps_of_a_spring_follow_the_exact_motion(surface: Surface) -> None:
     mass, step, count = 0.43, 0.0005, 20
-    spring = give(surface, mass, step)
+    spring = compliance(surface, mass, step)
     drag = spring.damping + spring.stiffness * step
     inward, seen = -1.0, [0.0]
     for _ in range(count):

@@ -1,1 +1,1 @@
-"""The truth: classical engines behind the same description of a scene."""
+"""Ground truth: classical engines behind the same description of a scene."""

@@ -1,15 +1,15 @@
-"""A second truth: the same scene in Bullet, to tell what is physics from what is one engine's habit.
+"""A second ground truth: the same scene in Bullet, to separate physics from properties of one engine.
 
 Bullet has no batched stepping: the worlds of a batch are stepped one after the other, each in a client of its own that
-takes about 34 MB. What it does otherwise than MuJoCo, and how its parameters follow from the scene:
+takes about 34 MB. Differences from MuJoCo, and how its parameters follow from the scene:
 
 Servos are torques, as in MuJoCo: clip(stiffness * (target - rotation vector)) - damping * relative velocity on each
-axis of the child. They are worked out once an engine step and held over it, where MuJoCo takes the damping implicitly.
-So that they stay stable, no moment of inertia of a link is less than what the servos at its joints undo in one step;
-of the human this touches the pelvis alone at the default step, and nothing at half of it.
+axis of the child. They are computed once an engine step and constant over it, where MuJoCo takes the damping
+implicitly. For stability, the moments of inertia of a link have a lower bound, given by the servos at its joints and
+the step; of the human it affects the pelvis alone at the default step, and nothing at half of it.
 
 Armature is inertia against turning relative to the parent, which Bullet lacks. It is added to the inertia of the child,
-where contacts feel it too, but where it also resists turning together with the parent.
+so that contacts act on it too, but there it also resists turning together with the parent.
 
 Contacts are springs and dampers in N/m and N s/m where a `Surface` has both per unit of effective mass; the mass of
 the whole body stands for it against the ground, and that of the lighter body between two bodies. Bullet joins the
@@ -19,7 +19,7 @@ implicit and lose energy to the step; stiffness and damping are such that a free
 and the engine step is divided further, under the same torques, where only a negative damping could do that.
 
 Friction holds at once, up to Coulomb's limit. MuJoCo's takes hold at the rate of the surface's damping, which for a
-football is slower than a kick: there the ball leaves the foot with less spin.
+football is slower than a kick: there the ball leaves the foot with less angular velocity.
 """
 
 from __future__ import annotations
@@ -37,30 +37,30 @@ from larp_model.engines.mujoco import SUBSTEPS, finite
 from larp_model.errors import InputError
 from larp_model.scene import Body, Link, Scene, Surface, Vector, anchor
 
-HARD = 1e18  # stiffness of what does not give way [N/m]
-FASTEST = 1e4  # Bullet cuts velocities of joints at 100 unless told otherwise [m/s, rad/s]
-DIVISIONS = 64  # of an engine step, at most: a surface without damping would ask for infinitely many
+HARD = 1e18  # stiffness of a rigid surface [N/m]
+FASTEST = 1e4  # limit of joint velocities, by default 100 in Bullet [m/s, rad/s]
+DIVISIONS = 64  # of an engine step, at most: a surface without damping would need infinitely many
 
 
-class Give(NamedTuple):
+class Compliance(NamedTuple):
     """The compliance of a surface in Bullet. stiffness: [N/m]. damping: [N s/m]."""
 
     stiffness: float
     damping: float
 
 
-def give(surface: Surface, mass: float, step: float) -> Give:
+def compliance(surface: Surface, mass: float, step: float) -> Compliance:
     """Return the spring and damper whose free contact, in implicit steps of `step` [s], follows the surface's exactly.
 
     An implicit step of v' = -k x - c v, c = damping + k step, multiplies states by a matrix of determinant b and of
-    trace 1 + b - k b step^2 / mass, b = 1 / (1 + c step / mass); both are known of the exact motion.
+    trace 1 + b - k b step^2 / mass, b = 1 / (1 + c step / mass), which are those of the exact motion.
     """
     decay = 0.5 * surface.damping
     square = surface.stiffness - decay**2
     swing = math.cos(math.sqrt(square) * step) if square >= 0.0 else math.cosh(math.sqrt(-square) * step)
     shrunk = math.exp(-2.0 * decay * step)
     stiffness = mass * (1.0 + shrunk - 2.0 * math.exp(-decay * step) * swing) / (shrunk * step**2)
-    return Give(stiffness, mass * (1.0 / shrunk - 1.0) / step - stiffness * step)
+    return Compliance(stiffness, mass * (1.0 / shrunk - 1.0) / step - stiffness * step)
 
 
 def inertia(link: Link) -> np.ndarray:
@@ -82,16 +82,16 @@ def _principal(link: Link) -> np.ndarray:
 
 
 def _divisions(surface: Surface, step: float) -> int:
-    """Return into how many parts an engine step of `step` [s] is divided, so that a damper can make up for them."""
-    enough = (count for count in range(1, DIVISIONS) if give(surface, 1.0, step / count).damping >= 0.0)
-    return next(enough, DIVISIONS)
+    """Return the number of parts of an engine step of `step` [s] at which no damping of a surface is negative."""
+    counts = (count for count in range(1, DIVISIONS) if compliance(surface, 1.0, step / count).damping >= 0.0)
+    return next(counts, DIVISIONS)
 
 
 class _Tree(NamedTuple):
-    """A body as Bullet sees it: link frames at the joints, inertia and collision shapes along the capsules.
+    """A body in Bullet: link frames at the joints, inertia and collision shapes along the capsules.
 
     rows: of its links in the state. soft: whether it carries its surface; else the ground under it does.
-    principal: (L, 3, 3) from the frame along the capsule, in which Bullet gives what turns, to the link's frame.
+    principal: (L, 3, 3) from the frame along the capsule, which Bullet uses for rotations, to the link's frame.
     stiffness, limit, damping: (L - 1, 1) of the joints; [N m/rad], [N m], [N m s/rad]. motors: joints with a motor.
     """
 
@@ -110,8 +110,8 @@ class _Tree(NamedTuple):
 def _tree(scene: Scene, body: Body, soft: bool) -> _Tree:
     passive = [0.0, math.inf]
     motors = [joint.motor for joint in body.joints]
-    push = [[motor.stiffness, motor.torque_limit] if motor else passive for motor in motors]
-    servo = np.array(push, float).reshape(-1, 2, 1)
+    stiffness_and_limit = [[motor.stiffness, motor.torque_limit] if motor else passive for motor in motors]
+    servo = np.array(stiffness_and_limit, float).reshape(-1, 2, 1)
     damping = [motor.damping if motor else joint.damping for motor, joint in zip(motors, body.joints, strict=True)]
     return _Tree(
         body,
@@ -125,6 +125,18 @@ def _tree(scene: Scene, body: Body, soft: bool) -> _Tree:
         np.flatnonzero([motor is not None for motor in motors]),
         scene.motor_rows(body.name),
     )
+
+
+def _stable_inertia(tree: _Tree, row: int, step: float) -> np.ndarray:
+    """Return moments of inertia (3,) [kg m^2] of a link and its armature, raised so that engine steps are stable."""
+    joints, moments = tree.body.joints, inertia(tree.body.links[row])
+    if row:
+        motor = joints[row - 1].motor
+        moments += motor.armature if motor else 0.0
+    # Explicit damping is stable where a step of it removes at most the velocity at both its ends.
+    at_link = [i for i, joint in enumerate(joints) if row in (i + 1, joint.parent)]
+    stable: np.ndarray = np.maximum(moments, step * (tree.damping[at_link] + step * tree.stiffness[at_link]).sum())
+    return stable
 
 
 def _soft_bodies(scene: Scene) -> set[str]:
@@ -170,11 +182,11 @@ class _World:
         return getattr(self._engine, name)(*arguments, **options, physicsClientId=self._client)
 
     def close(self) -> None:
-        """Give the client back; it goes back by itself with the world or with the interpreter."""
+        """Release the client; it is released by itself with the world or with the interpreter."""
         self._end()
 
-    def _add(self, tree: _Tree, step: float, division: float) -> int:
-        """Add a body with its own ground, and let them alone touch."""
+    def _create(self, tree: _Tree) -> int:
+        """Create a body's links and joints; return its number in the engine."""
         engine, links, joints = self._engine, tree.body.links, tree.body.joints
         anchors = [np.zeros(3)] + [_anchor(links[i], joint.child_anchor) for i, joint in enumerate(joints, start=1)]
         along = [Rotation.from_matrix(matrix).as_quat() for matrix in tree.principal]
@@ -185,44 +197,47 @@ class _World:
                 radius=link.radius,
                 **({"height": link.length} if link.length else {}),
                 collisionFramePosition=-own,
-                collisionFrameOrientation=turned,
+                collisionFrameOrientation=orientation,
             )
-            for link, own, turned in zip(links, anchors, along, strict=True)
+            for link, own, orientation in zip(links, anchors, along, strict=True)
         ]
-        index = self.call(
-            "createMultiBody",
-            links[0].mass,
-            shapes[0],
-            -1,
-            [0.0, 0.0, 0.0],
-            [0.0, 0.0, 0.0, 1.0],
-            baseInertialFrameOrientation=along[0],
-            linkMasses=[link.mass for link in links[1:]],
-            linkCollisionShapeIndices=shapes[1:],
-            linkVisualShapeIndices=[-1] * len(joints),
-            linkPositions=[_anchor(links[j.parent], j.parent_anchor) - anchors[j.parent] for j in joints],
-            linkOrientations=[[0.0, 0.0, 0.0, 1.0]] * len(joints),
-            linkInertialFramePositions=[-own for own in anchors[1:]],
-            linkInertialFrameOrientations=along[1:],
-            linkParentIndices=[joint.parent for joint in joints],
-            linkJointTypes=[engine.JOINT_SPHERICAL] * len(joints),
-            linkJointAxis=[[0.0, 0.0, 1.0]] * len(joints),
-            flags=engine.URDF_MAINTAIN_LINK_ORDER,
+        return int(
+            self.call(
+                "createMultiBody",
+                links[0].mass,
+                shapes[0],
+                -1,
+                [0.0, 0.0, 0.0],
+                [0.0, 0.0, 0.0, 1.0],
+                baseInertialFrameOrientation=along[0],
+                linkMasses=[link.mass for link in links[1:]],
+                linkCollisionShapeIndices=shapes[1:],
+                linkVisualShapeIndices=[-1] * len(joints),
+                linkPositions=[_anchor(links[j.parent], j.parent_anchor) - anchors[j.parent] for j in joints],
+                linkOrientations=[[0.0, 0.0, 0.0, 1.0]] * len(joints),
+                linkInertialFramePositions=[-own for own in anchors[1:]],
+                linkInertialFrameOrientations=along[1:],
+                linkParentIndices=[joint.parent for joint in joints],
+                linkJointTypes=[engine.JOINT_SPHERICAL] * len(joints),
+                linkJointAxis=[[0.0, 0.0, 1.0]] * len(joints),
+                flags=engine.URDF_MAINTAIN_LINK_ORDER,
+            )
         )
+
+    def _add(self, tree: _Tree, step: float, division: float) -> int:
+        """Add a body with its own ground, and let them alone touch."""
+        engine, index = self._engine, self._create(tree)
         # Bullet forgets what else a call sets on a link where it sets these too.
         self.call("changeDynamics", index, -1, linearDamping=0.0, angularDamping=0.0, maxJointVelocity=FASTEST)
         ground = self.call("createMultiBody", 0.0, self.call("createCollisionShape", engine.GEOM_PLANE))
         friction = tree.body.surface.friction
-        spring = give(tree.body.surface, tree.mass, division)
+        spring = compliance(tree.body.surface, tree.mass, division)
         hard = (1.0, HARD, 0.0)
         soft = (friction, spring.stiffness, max(spring.damping, 0.0))
         self._touch(ground, -1, *(hard if tree.soft else soft))
-        for link, described in enumerate(links, start=-1):
-            moments = inertia(described)
+        for link in range(-1, len(tree.body.joints)):
             if link >= 0:
-                motor = joints[link].motor
-                moments += motor.armature if motor else 0.0
-                self.call(  # a spherical joint comes with a motor that holds it
+                self.call(  # a spherical joint comes with a motor that brakes it
                     "setJointMotorControlMultiDof",
                     index,
                     link,
@@ -233,12 +248,9 @@ class _World:
                     force=[0.0, 0.0, 0.0],
                 )
             self._touch(index, link, *(soft if tree.soft else hard))
-            # Damping that is explicit is stable where a step of it undoes at most the velocity at both its ends.
-            tied = [i for i, joint in enumerate(joints) if link + 1 in (i + 1, joint.parent)]
-            moments = np.maximum(moments, step * (tree.damping[tied] + step * tree.stiffness[tied]).sum())
-            self.call("changeDynamics", index, link, localInertiaDiagonal=moments)
+            self.call("changeDynamics", index, link, localInertiaDiagonal=_stable_inertia(tree, link + 1, step))
             self.call("setCollisionFilterPair", ground, index, -1, link, 1)
-        return int(index)
+        return index
 
     def _touch(self, index: int, link: int, friction: float, stiffness: float, damping: float) -> None:
         """Set a link's friction and compliance, and let it collide with what is named alone."""
@@ -258,14 +270,15 @@ class _World:
         parts = []
         for tree, index in zip(self._trees, self._bodies, strict=True):
             pose, motion = self.call("getBasePositionAndOrientation", index), self.call("getBaseVelocity", index)
-            seen = [[*pose[0], *pose[1], *motion[0], *motion[1]]]
+            rows = [[*pose[0], *pose[1], *motion[0], *motion[1]]]
             if tree.body.joints:
                 children = list(range(len(tree.body.joints)))
                 for link in self.call("getLinkStates", index, children, 1, 1):
-                    seen.append([*link[0], *link[1], *link[6], *link[7]])
-            parts.append(np.array(seen))
-            turned = Rotation.from_quat(parts[-1][:, packed.ORIENTATION]) * Rotation.from_matrix(tree.principal).inv()
-            parts[-1][:, packed.ORIENTATION] = turned.as_quat(canonical=True, scalar_first=True)
+                    rows.append([*link[0], *link[1], *link[6], *link[7]])
+            parts.append(np.array(rows))
+            along = Rotation.from_quat(parts[-1][:, packed.ORIENTATION])
+            orientation = along * Rotation.from_matrix(tree.principal).inv()
+            parts[-1][:, packed.ORIENTATION] = orientation.as_quat(canonical=True, scalar_first=True)
         return np.concatenate(parts)
 
     def reset(self, state: np.ndarray) -> None:
@@ -283,9 +296,11 @@ class _World:
                 parents = [joint.parent for joint in tree.body.joints]
                 inward = along[1:].inv()
                 relative = inward * rotation[parents].inv() * rotation[1:] * along[1:]
-                spin = (inward * rotation[1:].inv()).apply(omega[1:] - omega[parents])
+                angular_velocity = (inward * rotation[1:].inv()).apply(omega[1:] - omega[parents])
                 children = list(range(len(parents)))
-                self.call("resetJointStatesMultiDof", index, children, relative.as_quat().tolist(), spin.tolist())
+                self.call(
+                    "resetJointStatesMultiDof", index, children, relative.as_quat().tolist(), angular_velocity.tolist()
+                )
 
     def step(self, substeps: int, control: np.ndarray, torque: np.ndarray) -> None:
         """Take engine steps under joint targets (J, 3) [rad] and torques on links (L, 3) [N m], world frame."""
@@ -299,21 +314,22 @@ class _World:
                 if tree.body.joints:
                     self._drive(tree, index, target)
                 for link in np.flatnonzero(torque[tree.rows].any(axis=1)):
-                    pushed = torque[tree.rows][link].tolist()
-                    self.call("applyExternalTorque", index, int(link) - 1, pushed, self._engine.WORLD_FRAME)
+                    link_torque = torque[tree.rows][link].tolist()
+                    self.call("applyExternalTorque", index, int(link) - 1, link_torque, self._engine.WORLD_FRAME)
             self.call("stepSimulation")
 
     def _drive(self, tree: _Tree, index: int, target: np.ndarray) -> None:
         """Apply the torques of servos and dampers to the joints, targets (J, 3) [rad]."""
         joints = list(range(len(tree.body.joints)))
-        seen = self.call("getJointStatesMultiDof", index, joints)
+        joint_states = self.call("getJointStatesMultiDof", index, joints)
         inner = tree.principal[1:]
-        turned = np.einsum("jab,jb->ja", inner, _rotation_vector(np.array([joint[0] for joint in seen])))
-        spin = np.einsum("jab,jb->ja", inner, np.array([joint[1] for joint in seen]))
-        push = np.clip(tree.stiffness * (target - turned), -tree.limit, tree.limit) - tree.damping * spin
-        push = np.einsum("jab,ja->jb", inner, push)
+        quaternions, rates = (np.array([joint[column] for joint in joint_states]) for column in (0, 1))
+        rotation_vectors = np.einsum("jab,jb->ja", inner, _rotation_vector(quaternions))
+        angular_velocity = np.einsum("jab,jb->ja", inner, rates)
+        torques = np.clip(tree.stiffness * (target - rotation_vectors), -tree.limit, tree.limit)
+        torques = np.einsum("jab,ja->jb", inner, torques - tree.damping * angular_velocity)
         mode = self._engine.TORQUE_CONTROL
-        self.call("setJointMotorControlMultiDofArray", index, joints, mode, forces=push.tolist())
+        self.call("setJointMotorControlMultiDofArray", index, joints, mode, forces=torques.tolist())
 
 
 def _anchor(link: Link, point: Vector) -> np.ndarray:
@@ -325,7 +341,8 @@ def _rotation_vector(quaternion: np.ndarray) -> np.ndarray:
     vector, scalar = quaternion[:, :3], quaternion[:, 3:]
     size = np.sqrt((vector * vector).sum(axis=1, keepdims=True))
     angle = 2.0 * np.arctan2(size, np.abs(scalar))
-    return vector * np.copysign(angle / np.maximum(size, 1e-300), scalar)
+    rotation_vector: np.ndarray = vector * np.copysign(angle / np.maximum(size, 1e-300), scalar)
+    return rotation_vector
 
 
 class BulletTruth:
@@ -360,10 +377,10 @@ class BulletTruth:
         needed = (self.batch, len(self.scene.links), 3)
         if np.shape(morphology) != needed:
             raise InputError(f"morphology has shape {np.shape(morphology)}, but needs {needed}")
-        self._fill([self.scene.sized(each) for each in morphology])
+        self._fill([self.scene.sized(sizes) for sizes in morphology])
 
     def close(self) -> None:
-        """Give the engine's memory back; the simulations are gone."""
+        """Release the engine's memory, and with it the simulations."""
         while self._worlds:
             self._worlds.pop().close()
 
@@ -392,8 +409,8 @@ class BulletTruth:
         """
         control = np.asarray(control, float).reshape(self.batch, -1, 3)
         torque = np.zeros((self.batch, len(self.scene.links), 3)) if torque is None else np.asarray(torque, float)
-        for world, targets, pushed in zip(self._worlds, control, torque, strict=True):
-            world.step(self.substeps, targets, pushed)
+        for world, targets, torques in zip(self._worlds, control, torque, strict=True):
+            world.step(self.substeps, targets, torques)
         return self.state()
 
     def rollout(
@@ -401,7 +418,7 @@ class BulletTruth:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Roll controls (N, H, J, 3) out from states (N, L, 13).
 
-        Returns the states (N, H, L, 13) after each step, and (N,) which of the trajectories did not diverge.
+        Returns the states (N, H, L, 13) after each step, and a mask (N,) of the trajectories that did not diverge.
         """
         self.reset(states)
         steps = [

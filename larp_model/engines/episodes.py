@@ -1,4 +1,4 @@
-"""Truth episodes: recorded, joined, stored and read again."""
+"""Ground-truth episodes: recorded, joined, stored and read again."""
 
 from __future__ import annotations
 
@@ -53,23 +53,25 @@ def record(
     if torques is None:
         torques = np.zeros((*controls.shape[:2], links, 3), np.float32)
     sizes = np.broadcast_to(truth.scene.morphology, (count, links, 3)) if morphology is None else morphology
-    kept, dropped = [], 0
+    parts, dropped = [], 0
     for start in range(0, count, truth.batch):
-        chosen = np.arange(start, start + truth.batch)
-        chosen[chosen >= count] = count - 1  # the last batch is filled up with copies
+        batch_rows = np.arange(start, start + truth.batch)
+        batch_rows[batch_rows >= count] = count - 1  # the last batch is filled up with copies
         if morphology is not None:
-            truth.resize(morphology[chosen])
-        truth.reset(states[chosen])
+            truth.resize(morphology[batch_rows])
+        truth.reset(states[batch_rows])
         first = truth.state()
-        after, finite = truth.rollout(states[chosen], controls[chosen], torques[chosen])
+        after, finite = truth.rollout(states[batch_rows], controls[batch_rows], torques[batch_rows])
         finite[count - start :] = False
         dropped += int((~finite[: count - start]).sum())
         whole = np.concatenate([first[:, None], after], axis=1)
-        rows = chosen[finite]
-        kept.append(
-            Episodes(*(each.astype(np.float32) for each in (whole[finite], controls[rows], torques[rows], sizes[rows])))
+        rows = batch_rows[finite]
+        parts.append(
+            Episodes(
+                *(array.astype(np.float32) for array in (whole[finite], controls[rows], torques[rows], sizes[rows]))
+            )
         )
-    return join(kept), dropped
+    return join(parts), dropped
 
 
 def join(parts: Sequence[Episodes]) -> Episodes:
@@ -85,7 +87,7 @@ def save(path: Path, scene: Scene, episodes: Episodes) -> None:
 
 
 def load(path: Path, scene: Scene) -> Episodes:
-    """Read episodes of this scene; refuses, by name, what is damaged or does not fit."""
+    """Read episodes of this scene; raise InputError for a file that is damaged or does not fit."""
     try:
         with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             header = dict(json.loads(str(file["header"])))
@@ -106,10 +108,10 @@ def load(path: Path, scene: Scene) -> Episodes:
         "morphology": (count, links, 3),
     }
     for name, shape in expected.items():
-        found = getattr(episodes, name)
-        if found.shape != shape:
-            raise InputError(f"episodes file {path}: {name} has shape {found.shape}, but the scene needs {shape}")
-        if not np.isfinite(found).all():
+        array = getattr(episodes, name)
+        if array.shape != shape:
+            raise InputError(f"episodes file {path}: {name} has shape {array.shape}, but the scene needs {shape}")
+        if not np.isfinite(array).all():
             raise InputError(f"episodes file {path}: {name} holds values that are not finite")
     if header.get("links") != [link.name for link in scene.links] or header.get("dt") != scene.dt:
         raise InputError(

@@ -1,7 +1,7 @@
-"""The truth: a scene in MuJoCo, stepped in threaded batches, read and written as packed states.
+"""Ground truth: a scene in MuJoCo, stepped in threaded batches, read and written as packed states.
 
 A step of `scene.dt` takes several engine steps, because the engine's usual steps are not converged for a kick: see
-`SUBSTEPS` and the test that holds it to its promise.
+`SUBSTEPS` and its test.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from larp_model.scene import Body, Link, Scene, Surface, anchor
 SUBSTEPS = 20
 # Where plans are executed: over a whole kick the errors of swing and launch add up (`tasks.benchmarks.speed`).
 FINE_SUBSTEPS = 80
-# The engine is trusted so far from the origin [m].
+# Distance from the origin beyond which a simulation counts as diverged [m].
 FARTHEST = 1e3
 
 
@@ -104,7 +104,7 @@ def cores() -> int:
 
 
 class Truth:
-    """A batch of simulations of one scene."""
+    """A batch of simulations of one scene: the ground truth."""
 
     def __init__(self, scene: Scene, batch: int = 1, substeps: int = SUBSTEPS, threads: int = 0) -> None:
         """batch: simulations side by side. substeps: engine steps in one `scene.dt`. threads: 0 takes all `cores`."""
@@ -139,7 +139,7 @@ class Truth:
         if np.shape(morphology) != needed:
             raise InputError(f"morphology has shape {np.shape(morphology)}, but needs {needed}")
         sizes, which = np.unique(np.asarray(morphology, float), axis=0, return_inverse=True)
-        models = [compile_model(self.scene.sized(each), self.substeps) for each in sizes]
+        models = [compile_model(self.scene.sized(link_sizes), self.substeps) for link_sizes in sizes]
         self._batch.set_models([models[index] for index in which.ravel()])
         self.morphology = np.asarray(morphology, float)
 
@@ -172,17 +172,17 @@ class Truth:
         for row, name in enumerate(self._names()):
             joint = self._joint[name]
             position, dof = self.model.jnt_qposadr[joint], self.model.jnt_dofadr[joint]
-            turned = matrix[:, row].transpose(0, 2, 1)
+            to_link = matrix[:, row].transpose(0, 2, 1)
             if row not in parents:
                 qpos[:, position : position + 3] = states[:, row, packed.POSITION]
                 qpos[:, position + 3 : position + 7] = states[:, row, packed.ORIENTATION]
                 qvel[:, dof : dof + 3] = states[:, row, packed.VELOCITY]
-                qvel[:, dof + 3 : dof + 6] = np.einsum("nij,nj->ni", turned, omega[:, row])
+                qvel[:, dof + 3 : dof + 6] = np.einsum("nij,nj->ni", to_link, omega[:, row])
             else:
                 parent = parents[row]
                 relative = Rotation.from_matrix(matrix[:, parent].transpose(0, 2, 1) @ matrix[:, row])
                 qpos[:, position : position + 4] = relative.as_quat(scalar_first=True)
-                qvel[:, dof : dof + 3] = np.einsum("nij,nj->ni", turned, omega[:, row] - omega[:, parent])
+                qvel[:, dof : dof + 3] = np.einsum("nij,nj->ni", to_link, omega[:, row] - omega[:, parent])
         batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
 
     def step(self, control: np.ndarray, torque: np.ndarray | None = None) -> np.ndarray:
@@ -203,7 +203,7 @@ class Truth:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Roll controls (N, H, J, 3) out from states (N, L, 13).
 
-        Returns the states (N, H, L, 13) after each step, and (N,) which of the trajectories did not diverge.
+        Returns the states (N, H, L, 13) after each step, and a mask (N,) of the trajectories that did not diverge.
         """
         self.reset(states)
         steps = [
@@ -214,32 +214,34 @@ class Truth:
 
 
 def closed(scene: Scene, states: np.ndarray, morphology: np.ndarray | None = None) -> np.ndarray:
-    """Return states (N, L, 13) whose joints are closed: links that are not roots are put where their joints hold them.
+    """Return states (N, L, 13) whose joints are closed: links other than roots are moved to their joints.
 
     morphology: (N, L, 3); the scene's by default.
     """
-    found = np.array(states, float)
+    result = np.array(states, float)
     usual = np.concatenate([body.sizes for body in scene.bodies])
-    sizes = np.broadcast_to(usual if morphology is None else morphology, (*found.shape[:2], 3))
+    sizes = np.broadcast_to(usual if morphology is None else morphology, (*result.shape[:2], 3))
     links = scene.links
-    turned = Rotation.from_quat(found[..., packed.ORIENTATION].reshape(-1, 4), scalar_first=True)
-    matrices = turned.as_matrix().reshape(*found.shape[:2], 3, 3)
+    rotations = Rotation.from_quat(result[..., packed.ORIENTATION].reshape(-1, 4), scalar_first=True)
+    matrices = rotations.as_matrix().reshape(*result.shape[:2], 3, 3)
 
     def arm(row: int, point: tuple[float, float, float]) -> np.ndarray:
         local = anchor(point, sizes[:, row, 0], sizes[:, row, 1], links[row].axis)
-        return np.einsum("nij,nj->ni", matrices[:, row], local)
+        world: np.ndarray = np.einsum("nij,nj->ni", matrices[:, row], local)
+        return world
 
     for child, parent, joint in scene.joints():
         near, far = arm(parent, joint.parent_anchor), arm(child, joint.child_anchor)
-        spins = (
-            np.cross(found[:, row, packed.ANGULAR_VELOCITY], reach) for row, reach in ((parent, near), (child, far))
+        parent_velocity, child_velocity = (
+            np.cross(result[:, row, packed.ANGULAR_VELOCITY], reach) for row, reach in ((parent, near), (child, far))
         )
-        found[:, child, packed.POSITION] = found[:, parent, packed.POSITION] + near - far
-        found[:, child, packed.VELOCITY] = found[:, parent, packed.VELOCITY] + next(spins) - next(spins)
-    return found
+        result[:, child, packed.POSITION] = result[:, parent, packed.POSITION] + near - far
+        result[:, child, packed.VELOCITY] = result[:, parent, packed.VELOCITY] + parent_velocity - child_velocity
+    return result
 
 
 def finite(states: np.ndarray) -> np.ndarray:
-    """Return (N,) which of the trajectories (N, H, L, 13) stayed finite and within physical limits."""
+    """Return a mask (N,) of the trajectories (N, H, L, 13) that stayed finite and within physical limits."""
     near = (np.abs(states[..., packed.POSITION]) < FARTHEST).all(axis=(1, 2, 3))
-    return near & packed.healthy(states).all(axis=1)
+    healthy: np.ndarray = near & packed.healthy(states).all(axis=1)
+    return healthy

@@ -23,11 +23,8 @@ def ball_motion(body: Body, links: Kinematics, torques: Array, gravity: float, d
     """Return the motion of a ball within `dt` [s] if nothing but the ground touches it; torques (1, 3, B) [N m]."""
     surface, h = body.surface, dt / SUBSTEPS
     length, radius, mass = links.sizes[0]
-    inverse_mass, inverse_moment, height = (
-        1.0 / mass,
-        1.0 / moments(length, radius, mass)[0],
-        links.position[0, 2] - radius,
-    )
+    inverse_mass, inverse_moment = 1.0 / mass, 1.0 / moments(length, radius, mass)[0]
+    height = links.position[0, 2] - radius
     regularisation = (1.0 - IMPEDANCE) / IMPEDANCE * inverse_mass  # R of `physics.contact`
     damping_factor = 1.0 - h * surface.damping / IMPEDANCE
     angular_gain = h * inverse_moment * torques[0]
@@ -39,10 +36,8 @@ def ball_motion(body: Body, links: Kinematics, torques: Array, gravity: float, d
         along, across = inverse_mass, inverse_mass + inverse_moment * lever**2
         # u_ref - u_free: tangential, by damping at the lowest point; normal, by the spring as well.
         slip_x, slip_y = vx - lever * wy, vy + lever * wx
-        tangential_x, tangential_y = (
-            slip_x * (damping_factor - 1.0) + lever * angular_gain[1],
-            slip_y * (damping_factor - 1.0) - lever * angular_gain[0],
-        )
+        tangential_x = slip_x * (damping_factor - 1.0) + lever * angular_gain[1]
+        tangential_y = slip_y * (damping_factor - 1.0) - lever * angular_gain[0]
         tangential = jnp.sqrt(tangential_x**2 + tangential_y**2 + 1e-16)
         normal_change = vz * (damping_factor - 1.0) + h * gravity - h * surface.stiffness / IMPEDANCE * gap
         normal_impulse, tangential_impulse = stuck_or_sliding(
@@ -53,11 +48,9 @@ def ball_motion(body: Body, links: Kinematics, torques: Array, gravity: float, d
         )
         jx, jy = share * tangential_x, share * tangential_y
         vx, vy, vz = vx + inverse_mass * jx, vy + inverse_mass * jy, vz - h * gravity + inverse_mass * normal
-        wx, wy, wz = (
-            wx + angular_gain[0] + inverse_moment * lever * jy,
-            wy + angular_gain[1] - inverse_moment * lever * jx,
-            wz + angular_gain[2],
-        )
+        wx = wx + angular_gain[0] + inverse_moment * lever * jy
+        wy = wy + angular_gain[1] - inverse_moment * lever * jx
+        wz = wz + angular_gain[2]
         return (x + h * vx, y + h * vy, z + h * vz, vx, vy, vz, wx, wy, wz), None
 
     velocity, angular_velocity = links.velocity, links.angular_velocity
@@ -73,9 +66,10 @@ def ball_motion(body: Body, links: Kinematics, torques: Array, gravity: float, d
         )
 
     lowest = height + jnp.minimum(dt * velocity[0, 2] - dt**2 * gravity, 0.0)
-    return jax.lax.cond(
+    motion: BodyMotion = jax.lax.cond(
         jnp.any(lowest < 0.0), on_the_ground, lambda: flight(body, links, torques, gravity, dt, SUBSTEPS)
     )
+    return motion
 
 
 def flight(

@@ -25,6 +25,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from larp_model.linalg import barrier, dot, inverse, mm, mv
@@ -88,7 +89,8 @@ def impulses_of(problem: ContactProblem, guess: Array, iterations: int) -> Array
         residual, largest = (
             jnp.max(jnp.abs(values), axis=(0, 1)) for values in (state.projected - state.impulses, state.impulses)
         )
-        return residual > TOLERANCE * jnp.finfo(largest.dtype).eps * largest
+        above: Array = residual > TOLERANCE * np.finfo(largest.dtype).eps * largest
+        return above
 
     def at(impulses: Array, velocity: Array) -> NewtonState:
         return NewtonState(impulses, velocity, *problem.impulses_and_slopes_at(velocity))

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from larp_model.linalg import barrier, cross, cross_columns, cross_rows, mv
@@ -132,7 +133,8 @@ class GroundProblem(NamedTuple):
         change = self.ends.velocity(after.velocity - before.velocity, after.angular_velocity - before.angular_velocity)
         error = after.impulses - before.impulses + mv(before.slopes, change)
         residual, largest = (jnp.max(jnp.abs(values), axis=(0, 1)) for values in (error, after.impulses))
-        return ~(residual > TOLERANCE * jnp.finfo(largest.dtype).eps * largest)
+        below: Array = ~(residual > TOLERANCE * np.finfo(largest.dtype).eps * largest)
+        return below
 
 
 def motion_on_ground(

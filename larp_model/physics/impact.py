@@ -93,27 +93,32 @@ def integrate(
     for body in scene.bodies:
         rows = scene.rows(body.name)
         if body.is_ball:
-            inverse_mass, inverse_moment = _inverse_inertias(links.sizes[rows])
-            is_side = sides.one_hot[:, rows.start][:, None]
-            (v, w), (x, t) = ((jnp.sum(is_side * f[0], axis=0), jnp.sum(is_side * m[0], axis=0)) for f, m in totals)
-            parts.append(
-                BodyMotion(
-                    inverse_mass * v[None], inverse_moment * w[None], inverse_mass * x[None], inverse_moment * t[None]
-                )
-            )
+            parts.append(_ball_change(links.sizes[rows], sides.one_hot[:, rows.start], totals))
         elif body.name in side_gains:
-            own_sides, (velocity, angular_velocity) = side_gains[body.name]
-            fields = []
-            for impulse_sums, moment_sums in totals:
-                wrench = jnp.stack(
-                    [jnp.concatenate([impulse_sums[:, side], moment_sums[:, side]], axis=1) for side in own_sides], 1
-                )
-                wrench = wrench.reshape(2, -1, wrench.shape[-1])
-                fields += [_summed(gains, wrench) for gains in (velocity, angular_velocity)]
-            parts.append(BodyMotion(*fields))
+            parts.append(_articulated_change(*side_gains[body.name], totals))
         else:
             parts.append(BodyMotion(*[jnp.zeros_like(links.position[rows])] * 4))
-    return BodyMotion(*(jnp.concatenate(gains) for gains in zip(*parts, strict=True)))
+    return BodyMotion(*(jnp.concatenate(fields) for fields in zip(*parts, strict=True)))
+
+
+def _ball_change(sizes: Array, one_hot: Array, totals: ImpulseTotals) -> BodyMotion:
+    """Return the motion (1, 3, B) that impulses add to a ball of sizes (1, 3, B), which is the sides one_hot (S, B)."""
+    inverse_mass, inverse_moment = _inverse_inertias(sizes)
+    is_side = one_hot[:, None]
+    (v, w), (x, t) = ((jnp.sum(is_side * f[0], axis=0), jnp.sum(is_side * m[0], axis=0)) for f, m in totals)
+    return BodyMotion(
+        inverse_mass * v[None], inverse_moment * w[None], inverse_mass * x[None], inverse_moment * t[None]
+    )
+
+
+def _articulated_change(own_sides: list[int], gains: tuple[Array, Array], totals: ImpulseTotals) -> BodyMotion:
+    """Return the motion (n, 3, B) that impulses at a body's own sides add to its links; gains: see `_side_gains`."""
+    fields = []
+    for impulses, angular_impulses in totals:
+        wrench = [jnp.concatenate([impulses[:, side], angular_impulses[:, side]], axis=1) for side in own_sides]
+        flat = jnp.stack(wrench, 1).reshape(2, -1, wrench[0].shape[-1])
+        fields += [_summed(gain, flat) for gain in gains]
+    return BodyMotion(*fields)
 
 
 def _side_gains(
@@ -309,18 +314,17 @@ class ContactSystem:
         # Accelerations are the mean ones in the middle of the step. Relaxation is no acceleration of the joints.
         from_middle = (number + 0.5) * h - 0.5 * self.dt
         rates = self.rates
-        velocity_change = (
-            h * (rates.acceleration + from_middle * rates.jerk) + (self.decay - 1.0) * state.transient_velocity
-        )
+        velocity_change = h * (rates.acceleration + from_middle * rates.jerk)
+        velocity_change += (self.decay - 1.0) * state.transient_velocity
         angular_velocity_change = h * (rates.angular_acceleration + from_middle * rates.angular_jerk)
         angular_velocity_change += (self.decay - 1.0) * state.transient_angular_velocity
         contact_velocity = self.relative(state.velocity + cross(state.angular_velocity, arms))
         velocity_product = self.relative(rates.velocity_product + cross(rates.angular_velocity_product, arms))
+        reference = contact.reference_velocity(self.stiffness, self.damping, contact_velocity, gap, normal, h)
         problem = ContactProblem(
             velocity=contact_velocity + self.relative(velocity_change + cross(angular_velocity_change, arms)),
             admittance=self.admittance(arms, gains),
-            reference=contact.reference_velocity(self.stiffness, self.damping, contact_velocity, gap, normal, h)
-            + h * velocity_product,
+            reference=reference + h * velocity_product,
             mass=self.mass,
             normal=normal,
             friction=self.friction,
@@ -330,42 +334,40 @@ class ContactSystem:
         side_impulses = jnp.concatenate([-impulses[: self.pairs], impulses])
         side_moments = cross(arms, side_impulses)
         gain, angular_gain = self.velocity_changes(gains, side_impulses, side_moments)
-        velocity = state.velocity + velocity_change + gain[0] + self.half_decay * gain[1]
-        angular_velocity = (
-            state.angular_velocity + angular_velocity_change + angular_gain[0] + self.half_decay * angular_gain[1]
-        )
+        transient, angular_transient = self.half_decay * gain[1], self.half_decay * angular_gain[1]
+        velocity = state.velocity + velocity_change + gain[0] + transient
+        angular_velocity = state.angular_velocity + angular_velocity_change + angular_gain[0] + angular_transient
         after = SideStates(
             centre=state.centre + h * velocity,
             half=turned(state.half, h * angular_velocity),
             velocity=velocity,
             angular_velocity=angular_velocity,
-            transient_velocity=self.decay * state.transient_velocity + self.half_decay * gain[1],
-            transient_angular_velocity=self.decay * state.transient_angular_velocity
-            + self.half_decay * angular_gain[1],
+            transient_velocity=self.decay * state.transient_velocity + transient,
+            transient_angular_velocity=self.decay * state.transient_angular_velocity + angular_transient,
             impulses=impulses,
         )
-        # Shares of these impulses' effects at the end of the step, and times for which they act until then.
-        remaining_time, relaxation_time = self.dt - (number + 0.5) * h, self.settings.fade
+        return (after, self._added(totals, side_impulses, side_moments, number)), None
+
+    def _added(self, totals: ImpulseTotals, impulses: Array, moments: Array, number: Array) -> ImpulseTotals:
+        """Return totals with impulses and angular impulses (S, 3, B) of a substep added."""
+        # Shares of their effects at the end of the step, and times for which they act until then.
+        remaining_time, relaxation_time = self.dt - (number + 0.5) * self.h, self.settings.fade
         relaxation = jnp.exp(-remaining_time / relaxation_time)
-        remaining_share = jnp.stack([jnp.ones_like(remaining_time), relaxation])
-        acting_time = jnp.stack([remaining_time, relaxation_time * (1.0 - relaxation)])
+        share = jnp.stack([jnp.ones_like(remaining_time), relaxation])[:, None, None, None]
+        time = jnp.stack([remaining_time, relaxation_time * (1.0 - relaxation)])[:, None, None, None]
         (impulse_sum, moment_sum), (impulse_time, moment_time) = totals
-        remaining_share, acting_time = (factors[:, None, None, None] for factors in (remaining_share, acting_time))
-        sums = (
-            (impulse_sum + remaining_share * side_impulses, moment_sum + remaining_share * side_moments),
-            (impulse_time + acting_time * side_impulses, moment_time + acting_time * side_moments),
+        return (
+            (impulse_sum + share * impulses, moment_sum + share * moments),
+            (impulse_time + time * impulses, moment_time + time * moments),
         )
-        return (after, sums), None
 
     def run(self) -> ImpulseTotals:
         """Return the impulses of all substeps."""
         zeros = jnp.zeros_like(self.position)
         no_impulses = jnp.zeros((self.pairs + self.balls, *zeros.shape[1:]), self.dtype)
-        centre_and_half = (
-            self.position + 0.5 * self.h * self.velocity,
-            turned(self.half, 0.5 * self.h * self.angular_velocity),
-        )
-        start = SideStates(*centre_and_half, self.velocity, self.angular_velocity, zeros, zeros, no_impulses)
+        centre = self.position + 0.5 * self.h * self.velocity
+        half = turned(self.half, 0.5 * self.h * self.angular_velocity)
+        start = SideStates(centre, half, self.velocity, self.angular_velocity, zeros, zeros, no_impulses)
         no_totals = jnp.zeros((2, *zeros.shape), self.dtype)
         numbers = jnp.arange(self.settings.substeps, dtype=self.dtype)
         (_, totals), _ = jax.lax.scan(self.substep, (start, ((no_totals, no_totals), (no_totals, no_totals))), numbers)

@@ -98,7 +98,8 @@ def local_anchors(scene: Scene, rows: np.ndarray, points: list[Vector], sizes: A
     point = np.array(points, np.float32).reshape(-1, 3)
     along = np.sum(axis * point, axis=-1, keepdims=True) * axis
     length, radius = sizes[rows, 0:1], sizes[rows, 1:2]
-    return 0.5 * length * along[..., None] + radius * (point - along)[..., None]
+    anchors: Array = 0.5 * length * along[..., None] + radius * (point - along)[..., None]
+    return anchors
 
 
 def displacement(scene: Scene, state: Array, morphology: Array) -> Array:

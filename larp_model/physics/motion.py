@@ -64,8 +64,36 @@ class Articulation(NamedTuple):
     angular_jerk: Array
 
 
-Carry = tuple[Array, Array, Array, Array]
-"""Start of a stage: rise (n, 1, B) and rotation vector (n, 3, B) so far, velocity, angular velocity (n, 3, B)."""
+class StageStart(NamedTuple):
+    """Start of a stage: rise (n, 1, B) [m] and rotation vector (n, 3, B) [rad] from the step's start, velocities."""
+
+    rise: Array
+    rotation_vector: Array
+    velocity: Array
+    angular_velocity: Array
+
+
+class StageEnd(NamedTuple):
+    """Velocities (n, 3, B) at the end of a stage, and inertia, the ground's contacts included, and anchors there."""
+
+    velocity: Array
+    angular_velocity: Array
+    inertia: Inertia
+    anchors: Anchors
+
+
+class BodyInputs(NamedTuple):
+    """Inputs of both stages of a step: see `articulated_motion`.
+
+    gravity: (3, 1) [m/s^2]. scale: see `motor_scale`. closing: of the joints, see `articulated.Level`.
+    """
+
+    links: Kinematics
+    targets: Array
+    torques: Array
+    gravity: Array
+    scale: Array
+    closing: Array
 
 
 def articulated_motion(
@@ -76,76 +104,63 @@ def articulated_motion(
 
     targets (j, 3, B) of its joints [rad], torques (n, 3, B) [N m], external. The inertia is that of the first stage.
     """
-    h, sizes, local = GAMMA * dt, links.sizes, links.local_anchors
-    parents = np.array([joint.parent for joint in body.joints], int)
-    orientation, velocity, angular_velocity = links.orientation, links.velocity, links.angular_velocity
-    scale = motor_scale(body, sizes)
+    h, remaining_time = GAMMA * dt, (1.0 - GAMMA) * dt
+    velocity, angular_velocity = links.velocity, links.angular_velocity
+    scale = motor_scale(body, links.sizes)
     down = jnp.array([0.0, 0.0, -gravity], velocity.dtype)[:, None]
-    closing = -constants.closing / dt * links.displacement
-
-    def stage(
-        rise: Array, rotation_vector: Array, velocity: Array, angular_velocity: Array
-    ) -> tuple[tuple[Array, Array], tuple[Inertia, Anchors]]:
-        """Return velocities and angular velocities at the end of a stage, and inertia and anchors; see `Carry`."""
-        start_orientation = rotated(orientation, rotation_vector)
-        matrices = rotation_matrices(rotated(start_orientation, h * angular_velocity))
-        inertia = inertias(body, matrices, sizes)
-        momentum, mass = mv(inertia.angular, angular_velocity), sizes[:, 2:3]
-        momenta = Momenta(momentum + h * (torques - cross(angular_velocity, momentum)), mass * (velocity + h * down))
-        anchors = turned_anchors(local, matrices, slice(1, None), parents)
-        start_matrices = rotation_matrices(start_orientation)
-        impulse, resistance = servos(body, start_orientation, start_matrices, targets, angular_velocity, h, scale)
-        height = links.position[:, 2:] + rise
-        anchors, impulse, resistance = barrier((anchors, impulse, resistance))
-        ends = Ends.of(
-            body,
-            start_matrices,
-            height,
-            velocity,
-            angular_velocity,
-            sizes,
-            h,
-            velocity_products(body, anchors, angular_velocity),
-        )
-        total_mass = jnp.sum(jnp.broadcast_to(mass, velocity[:, :1].shape), axis=0, keepdims=True)
-        problem = GroundProblem(
-            inertia, momenta, anchors, closing, impulse, resistance, ends, constants.standing * total_mass, h
-        )
-        motion = motion_on_ground(body, constants.iterations, problem, velocity + h * down, angular_velocity)
-        ground_inertia, _ = problem.linear(motion)
-        return (motion.velocity, motion.angular_velocity), (jax.tree.map(jnp.add, inertia, ground_inertia), anchors)
-
+    inputs = BodyInputs(links, targets, torques, down, scale, -constants.closing / dt * links.displacement)
     ratio = (1.0 - GAMMA) / GAMMA
 
-    def advance(carry: Carry, _: None) -> tuple[Carry, tuple[tuple[Array, Array], tuple[Inertia, Anchors]]]:
-        rise, rotation_vector, velocity, angular_velocity = carry
-        end_velocities, inertia_and_anchors = stage(rise, rotation_vector, velocity, angular_velocity)
-        remaining_time = (1.0 - GAMMA) * dt
+    def advance(start: StageStart, _: None) -> tuple[StageStart, StageEnd]:
+        end = _stage(body, constants, inputs, start, h)
         extrapolated = (
-            velocity + ratio * (end_velocities[0] - velocity),
-            angular_velocity + ratio * (end_velocities[1] - angular_velocity),
+            start.velocity + ratio * (end.velocity - start.velocity),
+            start.angular_velocity + ratio * (end.angular_velocity - start.angular_velocity),
         )
-        return (remaining_time * end_velocities[0][:, 2:], remaining_time * end_velocities[1], *extrapolated), (
-            end_velocities,
-            inertia_and_anchors,
-        )
+        rise, rotation_vector = remaining_time * end.velocity[:, 2:], remaining_time * end.angular_velocity
+        return StageStart(rise, rotation_vector, *extrapolated), end
 
     zero = jnp.zeros_like(angular_velocity)
-    _, ((velocities, angular_velocities), stages) = jax.lax.scan(
-        advance, (zero[:, 2:], zero, velocity, angular_velocity), length=2
-    )
+    first = StageStart(zero[:, 2:], zero, velocity, angular_velocity)
+    _, (velocities, angular_velocities, stage_inertias, stage_anchors) = jax.lax.scan(advance, first, length=2)
     translation, rotation_vector = (
         dt * ((1.0 - GAMMA) * one + GAMMA * two) for one, two in (velocities, angular_velocities)
     )
-    inertia, anchors = jax.tree.map(lambda values: values[0], stages)
     # Accelerations k_1 and k_2 at GAMMA and 1 of the step are (1 - GAMMA) k_1 + GAMMA k_2 on average, as if straight.
     jerk, angular_jerk = (
         ((after[1] - before) / dt - (after[0] - before) / h) / (GAMMA * (1.0 - GAMMA) * dt)
         for after, before in ((velocities, velocity), (angular_velocities, angular_velocity))
     )
-    return BodyMotion(velocities[1], angular_velocities[1], translation, rotation_vector), Articulation(
-        inertia, anchors, jerk, angular_jerk
+    motion = BodyMotion(velocities[1], angular_velocities[1], translation, rotation_vector)
+    inertia, anchors = jax.tree.map(lambda values: values[0], (stage_inertias, stage_anchors))
+    return motion, Articulation(inertia, anchors, jerk, angular_jerk)
+
+
+def _stage(body: Body, constants: Constants, inputs: BodyInputs, start: StageStart, h: float) -> StageEnd:
+    """Return the end of a stage of `h` [s]."""
+    links, targets, torques, gravity, scale, closing = inputs
+    velocity, angular_velocity, sizes = start.velocity, start.angular_velocity, links.sizes
+    parents = np.array([joint.parent for joint in body.joints], int)
+    orientation = rotated(links.orientation, start.rotation_vector)
+    end_matrices = rotation_matrices(rotated(orientation, h * angular_velocity))
+    inertia = inertias(body, end_matrices, sizes)
+    momentum, mass = mv(inertia.angular, angular_velocity), sizes[:, 2:3]
+    momenta = Momenta(momentum + h * (torques - cross(angular_velocity, momentum)), mass * (velocity + h * gravity))
+    anchors = turned_anchors(links.local_anchors, end_matrices, slice(1, None), parents)
+    matrices = rotation_matrices(orientation)
+    impulse, resistance = servos(body, orientation, matrices, targets, angular_velocity, h, scale)
+    height = links.position[:, 2:] + start.rise
+    anchors, impulse, resistance = barrier((anchors, impulse, resistance))
+    products = velocity_products(body, anchors, angular_velocity)
+    ends = Ends.of(body, matrices, height, velocity, angular_velocity, sizes, h, products)
+    total_mass = jnp.sum(jnp.broadcast_to(mass, velocity[:, :1].shape), axis=0, keepdims=True)
+    problem = GroundProblem(
+        inertia, momenta, anchors, closing, impulse, resistance, ends, constants.standing * total_mass, h
     )
+    motion = motion_on_ground(body, constants.iterations, problem, velocity + h * gravity, angular_velocity)
+    ground_inertia, _ = problem.linear(motion)
+    total_inertia = jax.tree.map(jnp.add, inertia, ground_inertia)
+    return StageEnd(motion.velocity, motion.angular_velocity, total_inertia, anchors)
 
 
 def velocity_products(body: Body, anchors: Anchors, angular_velocity: Array) -> tuple[Array, Array]:

@@ -93,10 +93,8 @@ def _gains(body: Body, anchors: Anchors, joints: list[EliminatedJoint], root: In
         child, arm = anchors.child[rows - 1], anchors.child[rows - 1] - anchors.parent[rows - 1]
         factored = barrier(mm(joint.inverse_factor, own[:, :3] - cross_columns(child, own[:, 3:])))
         factors.append(factored)
-        from_children, child_parents = (
-            barrier(shifted_wrench(arm, own - mm(jnp.swapaxes(joint.factored, 1, 2), factored))),
-            parents,
-        )
+        reduced = own - mm(jnp.swapaxes(joint.factored, 1, 2), factored)
+        from_children, child_parents = barrier(shifted_wrench(arm, reduced)), parents
     at_root = with_children(wrenches[:1], np.array([0]), from_children, child_parents)
     motions, order = [mm(packed_inertia(root), at_root)], [np.array([0])]
     for (rows, parents), joint, factored in zip(levels, joints, reversed(factors), strict=True):
