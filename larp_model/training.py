@@ -173,7 +173,7 @@ Update = Callable[[dict[str, Any], Any, Array, Any, float | Array], tuple[dict[s
 def update_of(model: Model, recipe: Recipe, weights: Weights) -> Update:
     """Return one step of gradient descent as a pure function; see `Update`.
 
-    Only the statistics of `weights` are used. A batch is dropped if its gradient is not finite, or beyond `recipe.drop`.
+    Only the statistics of `weights` are used. A batch whose gradient is not finite or beyond `recipe.drop` is dropped.
     """
     scene, transform = model.scene, optimiser(recipe)
     link_weights = emphasis(scene, recipe)
