@@ -62,13 +62,14 @@ def detect(
     is detected.
     """
     rows = link_pairs(pair, *bodies)
-    first, second = (capsules(own, link_rows) for own, link_rows in zip(links, rows, strict=True))
+    first, second = (capsules(start, link_rows) for start, link_rows in zip(links, rows, strict=True))
     (v1, w1), (v2, w2) = (
-        (own.velocity[link_rows], own.angular_velocity[link_rows]) for own, link_rows in zip(links, rows, strict=True)
+        (start.velocity[link_rows], start.angular_velocity[link_rows])
+        for start, link_rows in zip(links, rows, strict=True)
     )
     (v1_end, w1_end), (v2_end, w2_end) = (
-        (end[link_rows, packed.VELOCITY], end[link_rows, packed.ANGULAR_VELOCITY])
-        for end, link_rows in zip(after, rows, strict=True)
+        (after_step[link_rows, packed.VELOCITY], after_step[link_rows, packed.ANGULAR_VELOCITY])
+        for after_step, link_rows in zip(after, rows, strict=True)
     )
     dv1, dw1, dv2, dw2 = v1_end - v1, w1_end - w1, v2_end - v2, w2_end - w2
 

@@ -78,10 +78,10 @@ def humanoid(source: str | Path, names: Mapping[str, str] | None = None, name: s
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     usual = human(name)
-    own = _named(path.name, model, [link.name for link in usual.links], dict(names or {}))
-    owners = _owners(path.name, model, own)
-    geometries = [_geometry(path.name, model, data, owners, link) for link in own]
-    joints = _joints(path.name, model, data, own, usual)
+    body_of_link = _named(path.name, model, [link.name for link in usual.links], dict(names or {}))
+    owners = _owners(path.name, model, body_of_link)
+    geometries = [_geometry(path.name, model, data, owners, link) for link in body_of_link]
+    joints = _joints(path.name, model, data, body_of_link, usual)
     return _assembled(usual, geometries, joints)
 
 
@@ -90,19 +90,19 @@ def _named(file: str, model: mujoco.MjModel, links: Sequence[str], names: dict[s
     bodies = [model.body(row).name for row in range(1, model.nbody)]
     for link in names:
         require_known("names", link, links)
-    own = {}
+    body_of_link = {}
     for link in links:
         candidates = [names[link]] if link in names else [body for body in bodies if usual_name(body) == link]
         if len(candidates) != 1 or candidates[0] not in bodies:
             number = "several bodies" if len(candidates) > 1 else "no body"
             raise InputError(f"source: {file} has {number} for {link!r}, but needs one; it has {', '.join(bodies)}")
-        own[link] = int(model.body(candidates[0]).id)
-    return own
+        body_of_link[link] = int(model.body(candidates[0]).id)
+    return body_of_link
 
 
-def _owners(file: str, model: mujoco.MjModel, own: Mapping[str, int]) -> dict[int, str]:
+def _owners(file: str, model: mujoco.MjModel, body_of_link: Mapping[str, int]) -> dict[int, str]:
     """Return the link of ours that each of the file's bodies is, or is fixed to."""
-    owners = {body: link for link, body in own.items()}
+    owners = {body: link for link, body in body_of_link.items()}
     for body in range(1, model.nbody):  # parents come first
         parent = int(model.body_parentid[body])
         if body not in owners and parent not in owners:
@@ -144,10 +144,10 @@ def _geometry(
 
 
 def _joints(
-    file: str, model: mujoco.MjModel, data: mujoco.MjData, own: Mapping[str, int], usual: Body
+    file: str, model: mujoco.MjModel, data: mujoco.MjData, body_of_link: Mapping[str, int], usual: Body
 ) -> dict[str, FileJoint]:
     """Return the joint of each of our links, the root apart, with its parent."""
-    link_of = {body: link for link, body in own.items()}
+    link_of = {body: link for link, body in body_of_link.items()}
     file_joints: dict[frozenset[str], FileJoint] = {}
     for body in link_of:
         chain, parent = [body], int(model.body_parentid[body])
@@ -195,8 +195,8 @@ def _assembled(usual: Body, geometries: Sequence[LinkGeometry], joints: Mapping[
         return dimensionless_anchor(links[row], turns[row].apply(place - centres[row]))
 
     def fitted_joint(child: int, joint: Joint, file_joint: FileJoint) -> Joint:
-        rest: Vector = (0.0, 0.0, 0.0)
-        motor = replace(joint.motor, lower=rest, upper=rest) if file_joint.welded and joint.motor else joint.motor
+        zero: Vector = (0.0, 0.0, 0.0)
+        motor = replace(joint.motor, lower=zero, upper=zero) if file_joint.welded and joint.motor else joint.motor
         return Joint(joint.parent, anchor(joint.parent, file_joint.place), anchor(child, file_joint.place), motor)
 
     fitted_joints = (

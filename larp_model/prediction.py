@@ -26,8 +26,8 @@ def predict(
     What is compiled serves any H up to a multiple of `PADDED`.
     """
     parts, steps = [], controls.shape[1]
-    rest = ((0, 0), (0, -steps % PADDED), (0, 0), (0, 0))
-    controls, torques = np.pad(controls, rest), np.pad(torques, rest)
+    padding = ((0, 0), (0, -steps % PADDED), (0, 0), (0, 0))
+    controls, torques = np.pad(controls, padding), np.pad(torques, padding)
     for begin in range(0, len(states), chunk):
         rows = np.minimum(np.arange(begin, begin + chunk), len(states) - 1)
         inputs = (jnp.asarray(values[rows]) for values in (states, controls, torques, morphology))

@@ -113,22 +113,22 @@ class Windows:
             struck = np.flatnonzero((contacts >= 0) & (contacts - self.recipe.before_contact <= last))
             near_contact = min(round(self.recipe.contact_share * count), count if len(struck) else 0)
             anywhere = random.integers(len(contacts), size=count - near_contact)
-            chosen = np.concatenate(
+            episodes = np.concatenate(
                 [struck[random.integers(len(struck), size=near_contact)] if near_contact else struck[:0], anywhere]
             )
             if last < 0:
                 raise InputError(f"episodes have {source.controls.shape[1]} steps, but the unroll needs {steps}")
             start = random.integers(last + 1, size=count)
             back = random.integers(self.recipe.before_contact + 1, size=near_contact)
-            start[:near_contact] = np.clip(contacts[chosen[:near_contact]] - back, 0, last)
+            start[:near_contact] = np.clip(contacts[episodes[:near_contact]] - back, 0, last)
             columns = start[:, None] + np.arange(steps + 1)
-            rows = chosen[:, None]
+            rows = episodes[:, None]
             parts.append(
                 (
                     source.states[rows, columns],
                     source.controls[rows, columns[:, :-1]],
                     source.torques[rows, columns[:, :-1]],
-                    source.morphology[chosen],
+                    source.morphology[episodes],
                 )
             )
         return Batch(*(np.concatenate(column) for column in zip(*parts, strict=True)))
@@ -136,8 +136,8 @@ class Windows:
 
 def statistics_of(model: Model, windows: Windows, random: np.random.Generator, batches: int = 32) -> Weights:
     """Return initial weights, with statistics of single steps of the ground truth, drawn as in training."""
-    drawn = [windows.draw(random, 2) for _ in range(batches)]
-    states, controls, torques, morphology = (np.concatenate(column) for column in zip(*drawn, strict=True))
+    windows_of_steps = [windows.draw(random, 2) for _ in range(batches)]
+    states, controls, torques, morphology = (np.concatenate(column) for column in zip(*windows_of_steps, strict=True))
     turns = rotation.random_turns(jax.random.key(int(random.integers(2**31))), len(states))
     if not model.invariant:
         states = np.asarray(rotation.turn_states(jnp.asarray(states), turns[:, None]))
@@ -178,25 +178,25 @@ def update_of(model: Model, recipe: Recipe, weights: Weights) -> Update:
     scene, transform = model.scene, optimiser(recipe)
     link_weights = emphasis(scene, recipe)
 
-    def loss_of(networks: dict[str, Any], states: Array, drawn: Any) -> tuple[Array, dict[str, Array]]:
+    def loss_of(networks: dict[str, Any], states: Array, batch: Any) -> tuple[Array, dict[str, Array]]:
         all_weights = weights._replace(networks=networks)
         if isinstance(model, ResidualModel):
-            return step_loss(model, all_weights, states, drawn)
+            return step_loss(model, all_weights, states, batch)
         predicted = rollout(
-            model, all_weights, states[:, 0], drawn.controls, drawn.torques, drawn.morphology,
+            model, all_weights, states[:, 0], batch.controls, batch.torques, batch.morphology,
             stop_gradient=recipe.stop_gradient,
         )  # fmt: skip
-        return losses.total(scene, recipe.loss, link_weights, predicted, states[:, 1:], drawn.morphology)
+        return losses.total(scene, recipe.loss, link_weights, predicted, states[:, 1:], batch.morphology)
 
     def update(
-        networks: dict[str, Any], state: Any, key: Array, drawn: Any, rate: float | Array
+        networks: dict[str, Any], state: Any, key: Array, batch: Any, rate: float | Array
     ) -> tuple[dict[str, Any], Any, dict[str, Array]]:
-        states = drawn.states
+        states = batch.states
         if not model.invariant:
             turn = rotation.random_turns(key, len(states))
             states = rotation.turn_states(states, turn[:, None])
-            drawn = drawn._replace(torques=rotation.about_z(drawn.torques, turn[:, None, None]))
-        (loss, terms), gradient = jax.value_and_grad(loss_of, has_aux=True)(networks, states, drawn)
+            batch = batch._replace(torques=rotation.about_z(batch.torques, turn[:, None, None]))
+        (loss, terms), gradient = jax.value_and_grad(loss_of, has_aux=True)(networks, states, batch)
         norm = optax.tree.norm(gradient)
         accepted = jnp.isfinite(norm) & (norm < recipe.drop)
         gradient = jax.tree.map(lambda g: jnp.where(accepted, g, 0.0), gradient)
@@ -212,7 +212,7 @@ def update_of(model: Model, recipe: Recipe, weights: Weights) -> Update:
     return update
 
 
-def step_loss(model: ResidualModel, weights: Weights, states: Array, drawn: Any) -> tuple[Array, dict[str, Array]]:
+def step_loss(model: ResidualModel, weights: Weights, states: Array, batch: Any) -> tuple[Array, dict[str, Array]]:
     """Return the loss of residual networks in the first steps of windows (B, T + 1, L, 13).
 
     Errors are in standard deviations of the outputs; beyond `LARGE` they count linearly. Steps in which links of two
@@ -220,11 +220,11 @@ def step_loss(model: ResidualModel, weights: Weights, states: Array, drawn: Any)
     """
     before, after = states[:, 0], states[:, 1]
     separate = jnp.ones(len(states))
-    for _, points in contact_points(model.scene, before, drawn.morphology, after):
+    for _, points in contact_points(model.scene, before, batch.morphology, after):
         separate *= 1.0 - jnp.max(points.near, axis=1)
     separate /= jnp.maximum(jnp.sum(separate), 1.0)
     loss = jnp.zeros(())
-    arguments = drawn.controls[:, 0], drawn.torques[:, 0], drawn.morphology
+    arguments = batch.controls[:, 0], batch.torques[:, 0], batch.morphology
     for name, inputs, outputs in model.examples(before, after, *arguments):
         error = model.answer(weights, name, inputs) - weights.outputs[name].normalise(outputs)
         loss += jnp.sum(separate * jnp.mean(losses.pseudo_huber(error**2, LARGE), axis=1))
@@ -296,9 +296,9 @@ def train(
     with closing(manager), _progress_bar(quiet) as bar, SummaryWriter(board_folder) as board:
         task = bar.add_task("", total=recipe.updates, completed=first, note="")
         while index < recipe.updates:
-            drawn = windows.draw(np.random.default_rng((recipe.seed, index)), recipe.unroll(index))
+            batch = windows.draw(np.random.default_rng((recipe.seed, index)), recipe.unroll(index))
             key = jax.random.fold_in(jax.random.key(recipe.seed), index)
-            networks, state, terms = update(networks, state, key, drawn, learning_rate(recipe, index))
+            networks, state, terms = update(networks, state, key, batch, learning_rate(recipe, index))
             log.add(terms)
             if (index + 1) % 100 == 0 or index + 1 == recipe.updates:
                 now = time.perf_counter()
@@ -315,8 +315,8 @@ def train(
                 compiled = time.perf_counter()
             elif index == first + TIMED and math.isfinite(seconds):
                 now = time.perf_counter()
-                left = (seconds - (now - log.begin)) / ((now - compiled) / (TIMED - 1))
-                recipe = replace(recipe, updates=min(recipe.updates, index + max(1, int(left))))
+                updates_left = (seconds - (now - log.begin)) / ((now - compiled) / (TIMED - 1))
+                recipe = replace(recipe, updates=min(recipe.updates, index + max(1, int(updates_left))))
                 bar.update(task, total=recipe.updates)
     log.content["seconds"] = time.perf_counter() - log.begin
     return weights._replace(networks=networks), log.content

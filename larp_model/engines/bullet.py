@@ -196,10 +196,10 @@ class _World:
                 engine.GEOM_CAPSULE if link.length else engine.GEOM_SPHERE,
                 radius=link.radius,
                 **({"height": link.length} if link.length else {}),
-                collisionFramePosition=-own,
+                collisionFramePosition=-anchor,
                 collisionFrameOrientation=orientation,
             )
-            for link, own, orientation in zip(links, anchors, along, strict=True)
+            for link, anchor, orientation in zip(links, anchors, along, strict=True)
         ]
         return int(
             self.call(
@@ -215,7 +215,7 @@ class _World:
                 linkVisualShapeIndices=[-1] * len(joints),
                 linkPositions=[_anchor(links[j.parent], j.parent_anchor) - anchors[j.parent] for j in joints],
                 linkOrientations=[[0.0, 0.0, 0.0, 1.0]] * len(joints),
-                linkInertialFramePositions=[-own for own in anchors[1:]],
+                linkInertialFramePositions=[-anchor for anchor in anchors[1:]],
                 linkInertialFrameOrientations=along[1:],
                 linkParentIndices=[joint.parent for joint in joints],
                 linkJointTypes=[engine.JOINT_SPHERICAL] * len(joints),
@@ -285,13 +285,13 @@ class _World:
         """Put the world into the packed state (L, 13), with no memory of earlier contacts."""
         self.call("restoreState", self._fresh)
         for tree, index in zip(self._trees, self._bodies, strict=True):
-            own = state[tree.rows]
-            rotation = Rotation.from_quat(own[:, packed.ORIENTATION], scalar_first=True)
+            body_state = state[tree.rows]
+            rotation = Rotation.from_quat(body_state[:, packed.ORIENTATION], scalar_first=True)
             along = Rotation.from_matrix(tree.principal)
-            omega = own[:, packed.ANGULAR_VELOCITY]
+            omega = body_state[:, packed.ANGULAR_VELOCITY]
             base = (rotation[0] * along[0]).as_quat()
-            self.call("resetBasePositionAndOrientation", index, own[0, packed.POSITION], base)
-            self.call("resetBaseVelocity", index, own[0, packed.VELOCITY], omega[0])
+            self.call("resetBasePositionAndOrientation", index, body_state[0, packed.POSITION], base)
+            self.call("resetBaseVelocity", index, body_state[0, packed.VELOCITY], omega[0])
             if tree.body.joints:
                 parents = [joint.parent for joint in tree.body.joints]
                 inward = along[1:].inv()

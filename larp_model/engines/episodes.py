@@ -64,11 +64,14 @@ def record(
         after, finite = truth.rollout(states[batch_rows], controls[batch_rows], torques[batch_rows])
         finite[count - start :] = False
         dropped += int((~finite[: count - start]).sum())
-        whole = np.concatenate([first[:, None], after], axis=1)
+        trajectories = np.concatenate([first[:, None], after], axis=1)
         rows = batch_rows[finite]
         parts.append(
             Episodes(
-                *(array.astype(np.float32) for array in (whole[finite], controls[rows], torques[rows], sizes[rows]))
+                trajectories[finite].astype(np.float32),
+                controls[rows].astype(np.float32),
+                torques[rows].astype(np.float32),
+                sizes[rows].astype(np.float32),
             )
         )
     return join(parts), dropped

@@ -73,7 +73,7 @@ class PaperModel:
         scene, networks = self.scene, self.networks()
         links = kinematics(scene, jnp.moveaxis(state, 0, -1), jnp.moveaxis(morphology, 0, -1))
         by_body = {body.name: links.of(scene, body.name) for body in scene.bodies}
-        pushes = {
+        effects = {
             body.name: jnp.zeros((*state[:, scene.rows(body.name)].shape[:2], 6), state.dtype) for body in scene.bodies
         }
         for pair, both in pairs_by_kind(scene):
@@ -82,14 +82,14 @@ class PaperModel:
             features = contact_inputs(pair, both, jax.lax.stop_gradient(touching) if stop_gradient else touching)
             for body, link_rows, of_link in zip(both, detection.link_pairs(pair, *both), features, strict=True):
                 onto = jax.nn.one_hot(link_rows, len(body.links), dtype=state.dtype)
-                push = jnp.einsum("bpf,pl->blf", evaluate(networks[name], weights, name, of_link), onto)
-                pushes[body.name] += push
+                effect = jnp.einsum("bpf,pl->blf", evaluate(networks[name], weights, name, of_link), onto)
+                effects[body.name] += effect
         after = []
         for body in scene.bodies:
-            name, own, push = network_name("dynamics", body), by_body[body.name], pushes[body.name]
-            scaled = push[..., :3] / self.scale[0], push[..., 3:] / self.scale[1]
+            name, body_links, effect = network_name("dynamics", body), by_body[body.name], effects[body.name]
+            scaled = effect[..., :3] / self.scale[0], effect[..., 3:] / self.scale[1]
             rows, motors = scene.rows(body.name), scene.motor_rows(body.name)
-            inputs = side_by_side(body_inputs(body, own, control[:, motors], torque[:, rows]), *scaled)
+            inputs = side_by_side(body_inputs(body, body_links, control[:, motors], torque[:, rows]), *scaled)
             outputs = bounded(evaluate(networks[name], weights, name, inputs), self.bound)
             velocities = weights.outputs[name].restore(outputs).reshape(len(state), 2, len(body.links), 3)
             velocity, angular_velocity = velocities[:, 0], velocities[:, 1]
@@ -111,9 +111,10 @@ class PaperModel:
             outputs = Statistics.of(side_by_side(*velocities))
             measured[network_name("dynamics", body)] = Statistics.of(inputs).beside(6 * len(body.links)), outputs
         for pair, both in pairs_by_kind(scene):
-            own = links.of(scene, pair.first), links.of(scene, pair.second)
-            features = jnp.concatenate(contact_inputs(pair, both, own), axis=1)
-            points = detection.detect(pair, both, own, (own[0].state, own[1].state), scene.dt)
+            links_of_pair = links.of(scene, pair.first), links.of(scene, pair.second)
+            features = jnp.concatenate(contact_inputs(pair, both, links_of_pair), axis=1)
+            states = links_of_pair[0].state, links_of_pair[1].state
+            points = detection.detect(pair, both, links_of_pair, states, scene.dt)
             near = jnp.tile(points.near, (1, 2)).reshape(-1) + APART
             measured[network_name("contact", *both)] = (
                 Statistics.of(features.reshape(-1, features.shape[-1]), near), None
@@ -156,14 +157,17 @@ def contact_inputs(pair: Pair, bodies: tuple[Body, Body], links: tuple[Kinematic
     point relative to the link, the normal and the distance, when the step begins.
     """
     rows = detection.link_pairs(pair, *bodies)
-    points = closest(*(detection.capsules(own, link_rows) for own, link_rows in zip(links, rows, strict=True)))
+    points = closest(
+        *(detection.capsules(body_links, link_rows) for body_links, link_rows in zip(links, rows, strict=True))
+    )
     root = links[0].position[:1] * jnp.array([[1.0], [1.0], [0.0]], links[0].state.dtype)
 
-    def phi(own: Kinematics, link_rows: np.ndarray) -> Array:
-        return jnp.concatenate([own.position - root, own.state[:, 3:], own.sizes], axis=1)[link_rows]
+    def phi(body_links: Kinematics, link_rows: np.ndarray) -> Array:
+        features = [body_links.position - root, body_links.state[:, 3:], body_links.sizes]
+        return jnp.concatenate(features, axis=1)[link_rows]
 
     first, second = (phi(*side) for side in zip(links, rows, strict=True))
-    arms = [points.point - own.position[link_rows] for own, link_rows in zip(links, rows, strict=True)]
+    arms = [points.point - body_links.position[link_rows] for body_links, link_rows in zip(links, rows, strict=True)]
     by_first = jnp.concatenate([first, second, arms[0], points.normal, points.distance], axis=1)
     by_second = jnp.concatenate([second, first, arms[1], -points.normal, points.distance], axis=1)
     return jnp.moveaxis(by_first, -1, 0), jnp.moveaxis(by_second, -1, 0)

@@ -127,8 +127,8 @@ def network_inputs(body: Body, links: Kinematics, motion: BodyMotion, dt: float)
         links.displacement, velocities,
     ]  # fmt: skip
     rotated = rotation.about_z(jnp.moveaxis(jnp.concatenate(vectors), -1, 0), rotation.opposite(turn)[:, None])
-    rest = links.position[:, 2], links.sizes, ends
-    return turn, side_by_side(rotated, *(jnp.moveaxis(array, -1, 0) for array in rest))
+    other_inputs = links.position[:, 2], links.sizes, ends
+    return turn, side_by_side(rotated, *(jnp.moveaxis(array, -1, 0) for array in other_inputs))
 
 
 def true_motion(links: Kinematics, after: Array) -> BodyMotion:

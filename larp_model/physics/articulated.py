@@ -114,19 +114,19 @@ def inward_pass(
     )
     eliminated, from_children, child_parents = [], augmented[:0], np.array([], int)
     for level in reversed(levels):
-        own = barrier(with_children(augmented[level.rows], level.rows, from_children, child_parents))
+        link = barrier(with_children(augmented[level.rows], level.rows, from_children, child_parents))
         child, arm = level.child, level.child - level.parent
         # A S, and S' A S + G
-        along = own[:, :, :3] + cross_rows(own[:, :, 3:6], child)
+        along = link[:, :, :3] + cross_rows(link[:, :, 3:6], child)
         factor = inverse_cholesky(along[:, :3] - cross_columns(child, along[:, 3:]) + level.resistance)
-        momentum = own[:, :, 6] - mv(own[:, :, 3:6], level.closing)
+        momentum = link[:, :, 6] - mv(link[:, :, 3:6], level.closing)
         impulse = level.impulse + momentum[:, :3] - cross(child, momentum[:, 3:])
         # L^-1 (S' A), with which A - A S (L L')^-1 S' A stays positive in 32 bits, also of light links on stiff joints
         factored = barrier(mm(factor, jnp.concatenate([jnp.swapaxes(along, 1, 2), impulse[:, :, None]], axis=2)))
         relative = mm(jnp.swapaxes(factor, 1, 2), factored)
         eliminated.append(EliminatedJoint(relative[:, :, 6], relative[:, :, :6], factored[:, :, :6], factor))
         # What the joint passes on: A - A S (S' A S + G)^-1 S' A, about the parent's centre
-        own_columns = jnp.concatenate([own[:, :, :6], momentum[:, :, None]], axis=2)
+        own_columns = jnp.concatenate([link[:, :, :6], momentum[:, :, None]], axis=2)
         reduced = barrier(own_columns - mm(jnp.swapaxes(factored[:, :, :6], 1, 2), factored))
         shifted = shifted_wrench(arm, reduced)
         at_parent = shifted[:, :, :3] + cross_rows(shifted[:, :, 3:6], arm)
@@ -165,14 +165,14 @@ def inverse_inertia(inertia: Inertia) -> Inertia:
     return Inertia(angular, coupling, inverse_mass - mm(jnp.swapaxes(lever, 1, 2), coupling))
 
 
-def with_children(own: Array, rows: np.ndarray, from_children: Array, parents: np.ndarray) -> Array:
+def with_children(total: Array, rows: np.ndarray, from_children: Array, parents: np.ndarray) -> Array:
     """Return the values (n, ...) of links in these rows, plus those passed on by children (m, ...) of these parents."""
     children = [np.flatnonzero(parents == row) for row in rows]
-    from_children = jnp.concatenate([from_children, jnp.zeros_like(own[:1])])
+    from_children = jnp.concatenate([from_children, jnp.zeros_like(total[:1])])
     for number in range(max(map(len, children), default=0)):
-        chosen = [child_rows[number] if number < len(child_rows) else len(parents) for child_rows in children]
-        own = own + from_children[np.array(chosen)]
-    return own
+        row_of_child = [child_rows[number] if number < len(child_rows) else len(parents) for child_rows in children]
+        total = total + from_children[np.array(row_of_child)]
+    return total
 
 
 def shifted_wrench(arm: Array, wrench: Array) -> Array:

@@ -167,7 +167,7 @@ class Candidates:
 
         def at(time: Array) -> Array:
             position = links.position + time * (links.velocity + 0.5 * time * rates.acceleration)
-            half = turned(links.half, time * (links.angular_velocity + 0.5 * time * rates.angular_acceleration))
+            half = turned_vectors(links.half, time * (links.angular_velocity + 0.5 * time * rates.angular_acceleration))
             one, two = (CapsuleShapes(position[rows], half[rows], links.sizes[rows, 1:2]) for rows in (first, second))
             return closest(one, two).distance[:, 0]
 
@@ -208,7 +208,7 @@ def sides_of(candidates: Candidates, selection: Array) -> Sides:
     return Sides(jnp.concatenate([*of_links, *of_balls]), owners)
 
 
-def turned(vector: Array, by: Array) -> Array:
+def turned_vectors(vector: Array, by: Array) -> Array:
     """Return vectors (n, 3, B) turned by small rotation vectors (n, 3, B) [rad], to the second order."""
     once = cross(by, vector)
     return vector + once + 0.5 * cross(by, once)

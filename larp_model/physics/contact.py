@@ -99,9 +99,9 @@ def impulses_of(problem: ContactProblem, guess: Array, iterations: int) -> Array
         number, state = carry
         impulses, velocity, projected_impulses, slope = state
         # Linear around the velocities, J = q - M u'.
-        push = projected_impulses + mv(slope, velocity)
-        new_velocity = solve_blocks(_matrix(problem.admittance, slope), problem.after(push))
-        new_impulses = push - mv(slope, new_velocity)
+        offset = projected_impulses + mv(slope, velocity)
+        new_velocity = solve_blocks(_matrix(problem.admittance, slope), problem.after(offset))
+        new_impulses = offset - mv(slope, new_velocity)
         share = jnp.where(
             unconverged(state), _line_search(problem, (velocity, new_velocity), (impulses, new_impulses)), 0.0
         )

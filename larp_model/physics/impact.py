@@ -31,7 +31,7 @@ from larp_model.physics.collision import (
     closest,
     select,
     sides_of,
-    turned,
+    turned_vectors,
 )
 from larp_model.physics.contact import IMPEDANCE, ContactProblem
 from larp_model.physics.kinematics import Kinematics
@@ -147,10 +147,10 @@ def _couplings(scene: Scene, sides: Sides, side_gains: SideGains) -> tuple[np.nd
         for number, other in enumerate(own_sides):
             columns = [array[:, :, :, 6 * number : 6 * number + 6] for array in gains]
             for side in own_sides:
-                own = [select(one_hot[side][None], jnp.moveaxis(array, 1, 0))[0] for array in columns]
+                gains_of_pair = [select(one_hot[side][None], jnp.moveaxis(array, 1, 0))[0] for array in columns]
                 previous = couplings.get((side, other))
                 couplings[side, other] = (
-                    own if previous is None else [a + b for a, b in zip(previous, own, strict=True)]
+                    gains_of_pair if previous is None else [a + b for a, b in zip(previous, gains_of_pair, strict=True)]
                 )
     empty = jnp.zeros((2, 0, 3, 6, sides.one_hot.shape[-1]), sides.one_hot.dtype)
     velocity, angular_velocity = (
@@ -339,7 +339,7 @@ class ContactSystem:
         angular_velocity = state.angular_velocity + angular_velocity_change + angular_gain[0] + angular_transient
         after = SideStates(
             centre=state.centre + h * velocity,
-            half=turned(state.half, h * angular_velocity),
+            half=turned_vectors(state.half, h * angular_velocity),
             velocity=velocity,
             angular_velocity=angular_velocity,
             transient_velocity=self.decay * state.transient_velocity + transient,
@@ -366,7 +366,7 @@ class ContactSystem:
         zeros = jnp.zeros_like(self.position)
         no_impulses = jnp.zeros((self.pairs + self.balls, *zeros.shape[1:]), self.dtype)
         centre = self.position + 0.5 * self.h * self.velocity
-        half = turned(self.half, 0.5 * self.h * self.angular_velocity)
+        half = turned_vectors(self.half, 0.5 * self.h * self.angular_velocity)
         start = SideStates(centre, half, self.velocity, self.angular_velocity, zeros, zeros, no_impulses)
         no_totals = jnp.zeros((2, *zeros.shape), self.dtype)
         numbers = jnp.arange(self.settings.substeps, dtype=self.dtype)

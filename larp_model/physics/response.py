@@ -89,11 +89,11 @@ def _gains(body: Body, anchors: Anchors, joints: list[EliminatedJoint], root: In
     wrenches = jnp.concatenate([impulses.angular, impulses.linear], axis=1)
     from_children, child_parents = wrenches[:0], np.array([], int)
     for (rows, parents), joint in zip(reversed(levels), reversed(joints), strict=True):
-        own = barrier(with_children(wrenches[rows], rows, from_children, child_parents))
+        wrench = barrier(with_children(wrenches[rows], rows, from_children, child_parents))
         child, arm = anchors.child[rows - 1], anchors.child[rows - 1] - anchors.parent[rows - 1]
-        factored = barrier(mm(joint.inverse_factor, own[:, :3] - cross_columns(child, own[:, 3:])))
+        factored = barrier(mm(joint.inverse_factor, wrench[:, :3] - cross_columns(child, wrench[:, 3:])))
         factors.append(factored)
-        reduced = own - mm(jnp.swapaxes(joint.factored, 1, 2), factored)
+        reduced = wrench - mm(jnp.swapaxes(joint.factored, 1, 2), factored)
         from_children, child_parents = barrier(shifted_wrench(arm, reduced)), parents
     at_root = with_children(wrenches[:1], np.array([0]), from_children, child_parents)
     motions, order = [mm(packed_inertia(root), at_root)], [np.array([0])]
