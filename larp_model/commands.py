@@ -16,7 +16,7 @@ def kick() -> None:
 
 
 def train() -> None:
-    """Run `larp-train`: train networks from nothing."""
+    """Run `larp-train`: train networks."""
     _start("tasks.train")
 
 

@@ -1,4 +1,4 @@
-"""The model that ships: physics says how bodies move and touch, and networks correct articulated bodies' motion.
+"""The model that ships: physics of bodies and contacts, with residual networks for the motion of articulated bodies.
 
 Without networks (size None) it is physics alone, of any scene.
 """
@@ -24,11 +24,11 @@ from larp_model.scene import Body, Scene
 
 @dataclass(frozen=True)
 class ResidualModel:
-    """Physics, and what a network adds to the motion of each articulated body where no other body touches it.
+    """Physics, and a residual network for the motion of each articulated body where no other body touches it.
 
-    Inputs and outputs of a network are in the frame of the course of the root's axis. Inputs are of the motion that
-    physics gives, also relative to the ground, and describe capsules by their axes alone. size: of the networks; None
-    for none. bound: of their outputs, in standard deviations of what physics lacks.
+    Inputs and outputs of a network are in the frame of the course of the root's axis. Inputs describe the motion by
+    physics, also relative to the ground, and capsules by their axes alone. size: of the networks; None for none.
+    bound: of their outputs, in standard deviations of the errors of physics.
     """
 
     scene: Scene
@@ -88,10 +88,10 @@ class ResidualModel:
     def examples(
         self, before: Array, after: Array, control: Array, torque: Array, morphology: Array
     ) -> list[tuple[str, Array, Array]]:
-        """Return of each articulated body the name of its network, inputs (B, F), and what physics lacks (B, O).
+        """Return of each articulated body the name of its network, inputs (B, F), and errors of physics (B, O).
 
-        From true steps (B, L, 13) -> (B, L, 13). Where links touch within a step, more is lacking than a network can
-        know.
+        From true steps (B, L, 13) -> (B, L, 13). Errors of steps in which links touch cannot be predicted from the
+        inputs.
         """
         scene, dt, examples = self.scene, self.scene.dt, []
         state, end, targets, torques, sizes = (
@@ -106,14 +106,14 @@ class ResidualModel:
                 body, links, targets[scene.motor_rows(body.name)], torques[rows], scene.gravity, dt, self.constants
             )
             turn, inputs = network_inputs(body, links, motion, dt)
-            lacking = changes(links, true_motion(links, end[rows]), dt) - changes(links, motion, dt)
-            vectors = jnp.moveaxis(lacking, -1, 0).reshape(len(after), -1, 3)
+            error = changes(links, true_motion(links, end[rows]), dt) - changes(links, motion, dt)
+            vectors = jnp.moveaxis(error, -1, 0).reshape(len(after), -1, 3)
             outputs = rotation.about_z(vectors, rotation.opposite(turn)[:, None])
             examples.append((name, inputs, outputs.reshape(len(after), -1)))
         return examples
 
     def answer(self, weights: Weights, name: str, inputs: Array) -> Array:
-        """Return what a network adds (B, O), for inputs (B, F), in standard deviations of what physics lacks."""
+        """Return outputs (B, O) of a network for inputs (B, F), in standard deviations of the errors of physics."""
         return bounded(evaluate(self.networks()[name], weights, name, inputs), self.bound)
 
 

@@ -62,8 +62,8 @@ SideGains = dict[str, tuple[list[int], tuple[Array, Array]]]
 """By articulated body: the sides that it can be, and the gains of its links by impulses there, see `_side_gains`."""
 
 ImpulseTotals = tuple[tuple[Array, Array], tuple[Array, Array]]
-"""Impulses and angular impulses (2, S, 3, B) with their lasting and transient effect: on the velocities at the end of
-the step, and times the time for which they act."""
+"""Sums of impulses and angular impulses (2, S, 3, B), weighted for their lasting and transient effects: on velocities
+at the end of the step, and on displacements within it, where each is multiplied by the time that it acts."""
 
 
 def integrate(
