@@ -30,7 +30,7 @@ from larp_model.networks import Weights
 from larp_model.simulator import Simulator
 from tasks.command import prepare_jax, run
 from tasks.episodes.around_kick import random_episodes
-from tasks.episodes.candidates import tried_episodes
+from tasks.episodes.candidates import candidate_episodes
 from tasks.kick import Kick
 from tasks.scenarios import WINDOWS
 from tasks.task import HEIGHT
@@ -152,7 +152,7 @@ def trained(kick: Kick, model: Model, seed: int, clock: Clock) -> Weights:
     while not parts or (time.perf_counter() - begin < RANDOM_SHARE * clock.budget and len(parts) * DRAWN < MOST):
         parts.append(random_episodes(kick.scene, kick.reference, DRAWN, seed + len(parts))[0])
     random = truth_episodes.join(parts)
-    candidates = tried_episodes(kick, KICKS, ROLLOUTS_PER_PLAN, seed, CANDIDATE_SHARE * clock.budget)
+    candidates = candidate_episodes(kick, KICKS, ROLLOUTS_PER_PLAN, seed, CANDIDATE_SHARE * clock.budget)
     clock.tell(f"{len(random.states)} random episodes, {len(candidates.states)} of plans")
     recipe = replace(OVER_PHYSICS, updates=MOST, seed=seed)
     sources = [(episodes, float(len(episodes.states))) for episodes in (random, candidates)]

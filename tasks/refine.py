@@ -30,7 +30,7 @@ from tasks.command import run
 from tasks.exploration import exploration_std, smooth_noise
 from tasks.motions import key_poses
 from tasks.motions.key_poses import KeyPoses
-from tasks.motions.references import starts
+from tasks.motions.references import initial_states
 from tasks.targets import SHIFT
 
 # Aims of a kick: launch and toe speed [m/s], elevation of the launch [rad], earliest and latest step of the
@@ -144,7 +144,7 @@ def perform(
 ) -> dict[str, np.ndarray]:
     """Return the named costs (N, K) of N key poses, each executed under K disturbances."""
     kicks = len(shift)
-    states = np.repeat(starts(scene, poses), kicks, axis=0)
+    states = np.repeat(initial_states(scene, poses), kicks, axis=0)
     states[:, -1, :2] += np.tile(shift, (len(poses), 1))
     controls = np.stack([key_pose.controls(scene.bodies[0], WATCHED, scene.dt) for key_pose in poses])
     after, finite = truth.rollout(states, (controls[:, None] + noise).reshape(-1, *controls.shape[1:]))

@@ -20,7 +20,7 @@ from larp_model.errors import InputError
 from tasks.benchmarks import pose as benchmark
 from tasks.pose import aist, lift, metrics, safe_pickle
 from tasks.pose import figure as figures
-from tasks.pose.camera import Camera, looking
+from tasks.pose.camera import Camera, looking_at
 from tasks.pose.figure import SHARED
 from tasks.pose.points import POINTS, Keypoints
 
@@ -70,7 +70,7 @@ def annotated(folder: Path, points: np.ndarray, protocol: int = 4) -> Filmed:
     """A folder of AIST++ in which one camera of nine has seen points (T, P, 3) [m]."""
     middle = points.mean(axis=(0, 1))
     position, at = middle + np.array([1.5, -4.0, 0.6]), middle + np.array([0.1, 0.0, -0.1])
-    lens = looking(position, at, SPREAD[0], (1920.0, 1080.0))
+    lens = looking_at(position, at, SPREAD[0], (1920.0, 1080.0))
     turn = lens.turn @ AXES
     camera = {
         "name": "c06",
@@ -252,14 +252,14 @@ def test_what_aist_does_not_know_is_not_known(kick: np.ndarray, tmp_path: Path) 
     unknown = [row for row in range(len(POINTS)) if row not in KNOWN]
     assert {POINTS[row].partition("_")[2] for row in unknown} == {"heel", "toe"}
     assert np.isnan(points[:, unknown]).all() and np.isfinite(points[:, KNOWN]).all()
-    assert not film.seen[:, unknown].any() and film.seen[:, KNOWN].all()
+    assert not film.detected[:, unknown].any() and film.detected[:, KNOWN].all()
     blind, _, _ = aist.load(tmp_path / "aist", SEQUENCE, 0)
-    assert not blind.seen.any()
+    assert not blind.detected.any()
 
 
 def test_videos_are_of_a_sequence_and_a_camera() -> None:
-    assert aist.seen_by(VIDEO) == (SEQUENCE, VIEW) and aist.video(SEQUENCE, VIEW) == VIDEO
-    assert aist.seen_by(SEQUENCE) == (SEQUENCE, None)
+    assert aist.sequence_and_camera(VIDEO) == (SEQUENCE, VIEW) and aist.video(SEQUENCE, VIEW) == VIDEO
+    assert aist.sequence_and_camera(SEQUENCE) == (SEQUENCE, None)
 
 
 def test_sequences_that_aist_found_faulty_are_left_out(kick: np.ndarray, tmp_path: Path) -> None:

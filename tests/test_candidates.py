@@ -5,7 +5,7 @@ import pytest
 
 from larp_model.engines.mujoco import SUBSTEPS, Truth
 from tasks.episodes import candidates
-from tasks.episodes.candidates import tried_episodes
+from tasks.episodes.candidates import candidate_episodes
 from tasks.kick import Kick
 
 
@@ -15,8 +15,8 @@ def task() -> Kick:
 
 
 def test_what_is_tried_is_what_happens_in_the_truth(task: Kick, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(candidates, "STEPS", candidates.GaussNewton(rounds=1, directions=6))
-    episodes = tried_episodes(task, kicks=2, each=5, seed=3)
+    monkeypatch.setattr(candidates, "OPTIMIZER", candidates.GaussNewton(rounds=1, directions=6))
+    episodes = candidate_episodes(task, kicks=2, per_plan=5, seed=3)
     assert episodes.states.shape == (10, task.horizon + 1, len(task.scene.links), 13)
     after, finite = Truth(task.scene, 10, SUBSTEPS).rollout(episodes.states[:, 0], episodes.controls)
     assert finite.all()
@@ -26,13 +26,13 @@ def test_what_is_tried_is_what_happens_in_the_truth(task: Kick, monkeypatch: pyt
 
 
 def test_no_kick_is_begun_after_the_time_is_up(task: Kick, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(candidates, "STEPS", candidates.GaussNewton(rounds=1, directions=6))
-    assert len(tried_episodes(task, kicks=50, each=4, seed=3, seconds=0.0).states) == 4
+    monkeypatch.setattr(candidates, "OPTIMIZER", candidates.GaussNewton(rounds=1, directions=6))
+    assert len(candidate_episodes(task, kicks=50, per_plan=4, seed=3, seconds=0.0).states) == 4
 
 
 def test_the_balls_that_are_tried_fly_where_targets_are(task: Kick, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(candidates, "STEPS", candidates.GaussNewton(rounds=3, directions=12))
-    episodes = tried_episodes(task, kicks=3, each=1000, seed=4)
+    monkeypatch.setattr(candidates, "OPTIMIZER", candidates.GaussNewton(rounds=3, directions=12))
+    episodes = candidate_episodes(task, kicks=3, per_plan=1000, seed=4)
     velocity = episodes.states[:, -1, task.ball, 7:9]
     bearing = np.degrees(np.arctan2(velocity[:, 1], velocity[:, 0]))
     struck = np.linalg.norm(velocity, axis=-1) > 3.0

@@ -191,7 +191,7 @@ def folder() -> Iterator[Path]:
         yield Path(name)
 
 
-def loaded(write: Write, film: Film, **arguments: Any) -> formats.Loaded:
+def loaded(write: Write, film: Film, **arguments: Any) -> formats.LoadedKeypoints:
     with folder() as path:
         return formats.load(write(path, film), **{"rate": RATE, "size": SIZE, **arguments})
 
@@ -261,7 +261,7 @@ def test_a_frame_whose_number_is_missing_shows_nobody(tmp_path: Path) -> None:
     path = FORMATS["OpenPose BODY_25"][0](tmp_path, [[person] for person in film_of(4, 6)])
     (path / "film_000000000003_keypoints.json").unlink()
     (path / "._film_000000000003_keypoints.json").write_bytes(b"left by a file manager")
-    seen = formats.load(path, RATE).keypoints.seen.any(axis=1)
+    seen = formats.load(path, RATE).keypoints.detected.any(axis=1)
     assert seen.tolist() == [True, True, True, False, True, True]
 
 
@@ -281,8 +281,8 @@ def test_openpose_means_not_found_by_no_confidence_or_by_the_corner() -> None:
     people[1][POINTS.index("nose"), 2] = 0.0
     people[2][POINTS.index("left_knee"), :2] = 0.0
     found = loaded(FORMATS["OpenPose BODY_25"][0], [[person] for person in people]).keypoints
-    assert [(frame, POINTS[point]) for frame, point in np.argwhere(~found.seen)] == [(1, "nose"), (2, "left_knee")]
-    assert np.isnan(found.places[~found.seen]).all()
+    assert [(frame, POINTS[point]) for frame, point in np.argwhere(~found.detected)] == [(1, "nose"), (2, "left_knee")]
+    assert np.isnan(found.places[~found.detected]).all()
 
 
 def test_places_without_confidence_are_sure(tmp_path: Path) -> None:
@@ -298,7 +298,7 @@ def test_points_that_a_file_does_not_name_are_not_found(tmp_path: Path) -> None:
     some = np.array(film_of(8, 4))[:, :7]
     np.savez(tmp_path / "a.npz", points=some, names=POINTS[:7])
     found = formats.load(tmp_path / "a.npz", RATE).keypoints
-    assert not found.seen[:, 7:].any()
+    assert not found.detected[:, 7:].any()
     np.testing.assert_array_equal(found.confidence[:, :7], some[..., 2])
 
 
@@ -381,14 +381,14 @@ def test_a_person_is_followed_by_most_points_and_by_a_single_one() -> None:
             person[np.arange(len(POINTS)) != nose, 2] = 0.0
     assert loaded(FORMATS["AlphaPose HALPE"][0], [[person] for person in people]).people == 1
     # As long as a single point was all that was seen, nothing says how large the person is.
-    assert loaded(FORMATS["AlphaPose HALPE"][0], [[person] for person in people[7:]]).keypoints.seen[-1].any()
+    assert loaded(FORMATS["AlphaPose HALPE"][0], [[person] for person in people[7:]]).keypoints.detected[-1].any()
 
 
 def test_the_only_person_of_mediapipe_and_of_npz_may_be_lost_for_long() -> None:
     person = film_of(12, 1)
     film: Film = [person, *[[]] * 100, person]
     for name in ("MediaPipe", "npz, places"):
-        assert loaded(FORMATS[name][0], film).keypoints.seen[-1].any()
+        assert loaded(FORMATS[name][0], film).keypoints.detected[-1].any()
 
 
 def tracked(path: Path, film: list[list[tuple[int, Person]]], form: str) -> Path:
@@ -716,7 +716,7 @@ def test_nothing_else_in_a_file_fails_but_with_a_refusal_in_one_line(name: str, 
         damaged = max(written.iterdir()) if written.is_dir() else written
         dump(damaged, replaced(json.loads(damaged.read_bytes()), data.draw))
         try:
-            assert 0 < len(formats.load(written, RATE, SIZE).keypoints) <= formats._MOST_FRAMES
+            assert 0 < len(formats.load(written, RATE, SIZE).keypoints) <= formats._MAX_FRAMES
         except InputError as error:
             assert str(error).startswith(f"{written.name} has") or "understood are" in str(error)
             assert "\n" not in str(error)

@@ -38,30 +38,30 @@ def random_pose(random: np.random.Generator, figure: Figure, frames: int) -> Pos
 def kick() -> np.ndarray:
     """Points (T, P, 3) of the embedded kick, 50 frames a second, until after the strike."""
     reference, figure = embedded(human_and_ball()), figures.figure()
-    points = physical.Seen(figure.body, figure, np.zeros(SHARED))
+    points = physical.BodyPoints(figure.body, figure, np.zeros(SHARED))
     states = reference.states[: reference.strike + 40 : 2, : len(figure.body.links)]
     return np.asarray(points.points(states.astype(np.float32)), float)
 
 
 def film_of(
-    points: np.ndarray, seed: int, noise: synthetic_film.Noise = synthetic_film.USUAL
+    points: np.ndarray, seed: int, noise: synthetic_film.Noise = synthetic_film.USUAL_NOISE
 ) -> tuple[Keypoints, cameras.Camera]:
     random = np.random.default_rng(seed)
     lens = synthetic_film.camera_around(random, points)
-    return synthetic_film.seen(random, lens, points, 50.0, noise), lens
+    return synthetic_film.detected(random, lens, points, 50.0, noise), lens
 
 
 class TestCamera:
     @given(seeds)
     def test_what_lies_on_a_places_ray_is_projected_onto_the_place(self, seed: int) -> None:
         random = np.random.default_rng(seed)
-        lens = cameras.looking(random.uniform(-5, 5, 3) + np.array([0, 0, 6]), random.uniform(-1, 1, 3), 700.0, SIZE)
+        lens = cameras.looking_at(random.uniform(-5, 5, 3) + np.array([0, 0, 6]), random.uniform(-1, 1, 3), 700.0, SIZE)
         places = random.uniform(0.0, 800.0, (7, 2))
         points = lens.position + random.uniform(0.5, 20.0, (7, 1)) * lens.ray(places)
         np.testing.assert_allclose(lens.project(points), places, atol=1e-6)
 
     def test_it_sees_what_it_looks_at_in_the_middle_and_what_is_above_it_higher(self) -> None:
-        lens = cameras.looking(np.array([4.0, 1.0, 1.5]), np.array([0.0, 0.0, 1.0]), 900.0, SIZE)
+        lens = cameras.looking_at(np.array([4.0, 1.0, 1.5]), np.array([0.0, 0.0, 1.0]), 900.0, SIZE)
         middle, above = lens.project(np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.3]]))
         np.testing.assert_allclose(middle, (500.0, 400.0))
         assert abs(above[0] - 500.0) < 1e-6 and above[1] < 400.0
@@ -125,7 +125,7 @@ class TestFigure:
 
     def test_its_height_is_that_of_the_human_it_is_of(self) -> None:
         figure, proportions = figures.figure(), np.zeros(SHARED)
-        proportions[0] = np.log(1.6 / figures.USUAL)
+        proportions[0] = np.log(1.6 / figures.USUAL_HEIGHT)
         assert figure.height(proportions) == pytest.approx(1.6)
         proportions[1 + figures.PROPORTIONS.index(("shin", 0))] = 0.1
         assert figure.height(proportions) > 1.62
@@ -133,14 +133,14 @@ class TestFigure:
     def test_its_points_are_where_the_simulated_human_has_them(self) -> None:
         figure, random = figures.figure(), np.random.default_rng(3)
         pose, proportions = random_pose(random, figure, 4), 0.05 * random.standard_normal(SHARED)
-        body = figure.of(proportions)
+        body = figure.body_of(proportions)
         states = np.zeros((4, len(body.links), 13))
         turns = [Rotation.from_matrix(pose.turn)]
         for child, joint in enumerate(body.joints, start=1):
             turns.append(turns[joint.parent] * Rotation.from_rotvec(pose.angles[:, child - 1]))
         states[:, :, 3:7] = np.stack([each.as_quat(scalar_first=True) for each in turns], axis=1)
         states[:, 0, :3] = pose.place
-        seen = physical.Seen(body, figure, proportions).points(closed(Scene((body,)), states).astype(np.float32))
+        seen = physical.BodyPoints(body, figure, proportions).points(closed(Scene((body,)), states).astype(np.float32))
         np.testing.assert_allclose(seen, figure.all_points(pose, proportions), atol=1e-5)
 
 
@@ -202,7 +202,7 @@ class TestEquations:
                     jacobian[:, -shared:] += each[frame, :, size:]
                 whole += jacobian.T * weights[frame] @ jacobian
                 slope += jacobian.T @ (weights[frame] * residual[frame])
-        own, common = band.solved(0.1)
+        own, common = band.solve(0.1)
         expected = -np.linalg.solve(whole + 0.1 * np.diag(np.diag(whole)), slope)
         np.testing.assert_allclose(np.concatenate([own.ravel(), common]), expected, rtol=1e-3, atol=1e-5)
 
@@ -211,11 +211,11 @@ class TestFilms:
     def test_without_noise_a_film_shows_where_points_are(self, kick: np.ndarray) -> None:
         film, lens = film_of(kick, 5, synthetic_film.Noise(0.0, 0.0, 0.0))
         np.testing.assert_allclose(film.places, lens.project(kick))
-        assert film.seen.all() and (film.places > 0.0).all() and (film.places < synthetic_film.SIZE[0]).all()
+        assert film.detected.all() and (film.places > 0.0).all() and (film.places < synthetic_film.SIZE[0]).all()
 
     def test_what_is_missed_has_no_confidence(self, kick: np.ndarray) -> None:
         film, _ = film_of(kick, 5, synthetic_film.Noise(4.0, 0.3, 0.1))
-        assert (np.isnan(film.places[..., 0]) == ~film.seen).all() and 0.1 < (~film.seen).mean() < 0.9
+        assert (np.isnan(film.places[..., 0]) == ~film.detected).all() and 0.1 < (~film.detected).mean() < 0.9
 
     def test_a_figure_laid_over_a_kick_is_near_the_true_one(self, kick: np.ndarray) -> None:
         film, lens = film_of(kick, 11)
@@ -228,7 +228,7 @@ class TestFilms:
     def test_a_person_of_known_height_is_as_large_and_as_far_whatever_the_image(self, kick: np.ndarray) -> None:
         small = 1.6 / 1.75 * kick
         film, lens = film_of(small, 17)
-        lifted = lift.lift(film, cameras.held(lens.focal, synthetic_film.SIZE), known=False, height=1.6)
+        lifted = lift.lift(film, cameras.handheld(lens.focal, synthetic_film.SIZE), position_known=False, height=1.6)
         found = figures.figure().all_points(lifted.pose, lifted.proportions)
         far, true = (
             np.linalg.norm(metrics.pelvis(points)[:, 0] - np.asarray(by.position), axis=1).mean()
@@ -252,7 +252,7 @@ class TestFilms:
 
     def test_a_camera_of_which_only_the_lens_is_known_is_found_with_the_motion(self, kick: np.ndarray) -> None:
         film, lens = film_of(kick, 13)
-        lifted = lift.lift(film, cameras.held(lens.focal, synthetic_film.SIZE), known=False)
+        lifted = lift.lift(film, cameras.handheld(lens.focal, synthetic_film.SIZE), position_known=False)
         found = figures.figure().all_points(lifted.pose, lifted.proportions)
         errors = metrics.position_errors(found, kick)
         tilt, found_tilt = (float(np.arcsin(-np.asarray(each.turn)[2, 2])) for each in (lens, lifted.camera))

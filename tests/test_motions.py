@@ -14,7 +14,7 @@ from larp_model.detection import first_contacts
 from larp_model.engines.mujoco import Truth
 from larp_model.physics import kinematics
 from larp_model.scene import Body
-from tasks.episodes.any_motion import any_episodes, in_motion, planted
+from tasks.episodes.any_motion import any_episodes, states_in_motion, with_planted_foot
 from tasks.episodes.people import BUILD, HEIGHT, MASS, VARIED, random_people
 from tasks.motions import references, styles
 from tasks.motions.details import in_detail
@@ -152,7 +152,7 @@ def test_every_style_stays_within_what_the_joints_can_do_and_moves_smoothly(styl
 def test_humans_in_motion_are_whole_and_stand_on_the_ground_or_above(reference: references.Reference) -> None:
     random = np.random.default_rng(5)
     sizes = random_people(random, SCENE, COUNT)
-    states, _ = in_motion(random, SCENE, reference, sizes, STEPS)
+    states, _ = states_in_motion(random, SCENE, reference, sizes, STEPS)
     apart = kinematics.displacement(SCENE, jnp.asarray(states), jnp.asarray(sizes))
     above = clearance(HUMAN, states[:, ROWS], sizes[:, ROWS])
     assert float(jnp.abs(apart).max()) < 1e-5
@@ -161,7 +161,7 @@ def test_humans_in_motion_are_whole_and_stand_on_the_ground_or_above(reference: 
 
 def test_a_planted_foot_rests(reference: references.Reference) -> None:
     states = np.repeat(reference.states[25:26, ROWS], 200, axis=0)
-    found = planted(np.random.default_rng(0), HUMAN, states)
+    found = with_planted_foot(np.random.default_rng(0), HUMAN, states)
     feet = found[:, [HUMAN.link("left_foot"), HUMAN.link("right_foot")]]
     lower = feet[np.arange(200), np.argmin(feet[..., 2], axis=1)]
     slow = np.linalg.norm(lower[:, packed.VELOCITY], axis=-1) < 0.8

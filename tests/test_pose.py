@@ -30,12 +30,12 @@ from tasks.pose.points import POINTS, Keypoints, interpolated
 def film() -> dict[str, Any]:
     """Keypoints of the swing and the strike of the embedded kick, its camera, and where its points truly are."""
     reference, figure = embedded(human_and_ball()), figures.figure()
-    points = physical.Seen(figure.body, figure, np.zeros(SHARED))
+    points = physical.BodyPoints(figure.body, figure, np.zeros(SHARED))
     states = reference.states[: reference.strike + 20 : 2, : len(figure.body.links)]
     true = np.asarray(points.points(states.astype(np.float32)), float)
     random = np.random.default_rng(4)
     lens = synthetic_film.camera_around(random, true)
-    return {"keypoints": synthetic_film.seen(random, lens, true, 50.0), "lens": lens, "true": true}
+    return {"keypoints": synthetic_film.detected(random, lens, true, 50.0), "lens": lens, "true": true}
 
 
 def written(folder: Path, keypoints: Keypoints, **changed: Any) -> Path:
@@ -52,7 +52,7 @@ def test_a_film_becomes_a_motion_in_mujoco_and_a_reference(film: dict[str, Any],
     camera.write_text(json.dumps({"focal": lens.focal, "position": lens.position.tolist(), "look_at": at}))
     command.main(written(tmp_path, film["keypoints"]), camera=camera, preset="fast", out=out, quiet=True)
     summary = json.loads((out / "summary.json").read_text())
-    assert not summary["camera_seems_to_move"] and summary["slip_m_s"] < command.SLIPPING
+    assert not summary["camera_seems_to_move"] and summary["slip_m_s"] < command.MAX_SLIP
     assert not summary["fell"] and summary["error_px"] < 25.0 and summary["candidates"] > 100
     assert summary["preset"] == "fast" and summary["truth_rollouts"] == 0
     assert summary["height_m"] == pytest.approx(1.75, abs=0.15)
@@ -69,7 +69,7 @@ def test_a_film_becomes_a_motion_in_mujoco_and_a_reference(film: dict[str, Any],
 def test_a_reconstruction_that_was_cut_off_goes_on_as_if_it_had_not_been(
     film: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(reconstruction, "OFTEN", 0.0)
+    monkeypatch.setattr(reconstruction, "SAVE_INTERVAL", 0.0)
     whole, again = tmp_path / "whole", tmp_path / "again"
     short = film["keypoints"].cut(0, 19)
     keypoints = written(tmp_path, short)
@@ -101,7 +101,9 @@ def test_a_film_by_a_camera_that_follows_the_person_is_told_of(
     random, true = np.random.default_rng(4), benchmark.filmed_points(None, 2.0)[::2]
     lens, camera = synthetic_film.camera_around(random, true), tmp_path / "camera.json"
     camera.write_text(json.dumps({"focal": lens.focal}))
-    seen = synthetic_film.seen(random, lens, synthetic_film.panned(lens, true) if moves else true, 0.5 * benchmark.RATE)
+    seen = synthetic_film.detected(
+        random, lens, synthetic_film.panned(lens, true) if moves else true, 0.5 * benchmark.RATE
+    )
 
     def enough(*_: Any) -> None:
         raise KeyboardInterrupt
@@ -126,7 +128,7 @@ def test_what_was_kept_of_another_film_or_is_damaged_is_of_no_use(film: dict[str
 @pytest.mark.parametrize("height", command.HEIGHTS)
 def test_people_of_all_heights_are_simulated_as_large_as_they_are(height: float) -> None:
     figure, proportions = figures.figure(), np.zeros(SHARED)
-    proportions[0] = np.log(height / figures.USUAL)
+    proportions[0] = np.log(height / figures.USUAL_HEIGHT)
     assert figure.height(np.asarray(proportions)) == pytest.approx(height, rel=0.01)
 
 

@@ -27,7 +27,7 @@ from larp_model.physics import kinematics
 from larp_model.training import Windows
 from tasks import train
 from tasks.benchmarks import model
-from tasks.episodes.around_kick import overlaps, resting
+from tasks.episodes.around_kick import overlaps, resting_height
 from tasks.motions.references import clearance
 from tasks.scenarios import SCENARIOS, around, scenario
 
@@ -59,7 +59,9 @@ def test_joints_hold_in_the_truth(drawn: tuple[str, Episodes]) -> None:
 def test_nothing_starts_in_the_ground_or_in_another_body(drawn: tuple[str, Episodes]) -> None:
     scene, start, sizes = SCENARIOS[drawn[0]].scene, drawn[1].states[:, 0], drawn[1].morphology
     human = scene.rows("human") if drawn[0].startswith("human") else slice(0, 0)  # who stands on it, or leans
-    above = [start[:, row, 2] - resting(link, start[:, row], sizes[:, row]) for row, link in enumerate(scene.links)]
+    above = [
+        start[:, row, 2] - resting_height(link, start[:, row], sizes[:, row]) for row, link in enumerate(scene.links)
+    ]
     free = [row for row in range(len(scene.links)) if not human.start <= row < human.stop]
     assert all(above[row].min() > -1e-5 for row in free)
     assert not overlaps(scene, start, sizes).any()

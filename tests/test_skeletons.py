@@ -113,7 +113,7 @@ def reframed(motion: Motion, turns: Rotation) -> Motion:
 
 def rested(motion: Motion) -> Motion:
     """The motion in the frames that it is told to have in a T-pose."""
-    rest = rest_pose.resting(motion)
+    rest = rest_pose.rest_orientations(motion)
     own = [motion.rotation(name) * turn.inv() for name, turn in zip(motion.names, rest, strict=True)]
     return replace(motion, orientations=np.stack([each.as_quat(scalar_first=True) for each in own], axis=1))
 

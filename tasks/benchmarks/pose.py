@@ -28,7 +28,7 @@ from tasks.pose import lift, metrics, physical, synthetic_film
 from tasks.pose.camera import Camera
 from tasks.pose.figure import SHARED
 from tasks.pose.points import Keypoints, interpolated
-from tasks.pose.reconstruction import reconstruct, shown
+from tasks.pose.reconstruction import frames_with_person, reconstruct
 from tasks.presets import PresetName
 
 # Frame rate of a synthetic film [1/s], and the share of it before a kick's strike.
@@ -143,7 +143,7 @@ def filmed_points(clip: Path | None, seconds: float) -> np.ndarray:
     if clip is None:
         reference, figure = embedded(human_and_ball()), figures.figure()
         states = reference.states[:, : len(figure.body.links)].astype(np.float32)
-        points = np.asarray(physical.Seen(figure.body, figure, np.zeros(SHARED)).points(states), float)
+        points = np.asarray(physical.BodyPoints(figure.body, figure, np.zeros(SHARED)).points(states), float)
         rate, strike = 100.0, reference.strike / 100.0
     else:
         motion = motion_of(clip)
@@ -163,7 +163,7 @@ def film_of_clip(clip: Path | None, camera: int, seconds: float, seed: int) -> F
     random = np.random.default_rng((seed, camera))
     lens = synthetic_film.camera_around(random, true)
     name = "embedded" if clip is None else clip.stem
-    return Film(name, synthetic_film.seen(random, lens, true, RATE), lens, true)
+    return Film(name, synthetic_film.detected(random, lens, true, RATE), lens, true)
 
 
 def film_of_dance(folder: Path, sequence: str, camera: int, seconds: float) -> Film:
@@ -172,7 +172,7 @@ def film_of_dance(folder: Path, sequence: str, camera: int, seconds: float) -> F
     keypoints, lens, true = dances.load(folder, sequence, camera)
     excerpt = keypoints.cut(0, round(seconds * keypoints.rate) - 1)
     try:
-        first, last = shown(excerpt)
+        first, last = frames_with_person(excerpt)
     except InputError as error:
         raise InputError(f"sequences has {name!r}, whose {error}") from None
     true = true[first : last + 1]
@@ -187,11 +187,11 @@ def dances_of(folder: Path, names: Sequence[str], cameras: int, seconds: float) 
     Loads each film once, to raise an error if one is missing or damaged.
     """
     available = sorted(dances.sequences(folder).keys() & {path.stem for path in (folder / "keypoints2d").glob("*.pkl")})
-    names = names or [video for video in EASY if dances.seen_by(video)[0] in available] or available
+    names = names or [video for video in EASY if dances.sequence_and_camera(video)[0] in available] or available
     if not names:
         raise InputError(f"aist is {str(folder)!r}, but keypoints2d in it has no sequence that mapping.txt has")
     films: dict[str, Callable[[], Film]] = {}
-    for sequence, only in map(dances.seen_by, names):
+    for sequence, only in map(dances.sequence_and_camera, names):
         for camera in range(cameras) if only is None else (only,):
             film = partial(film_of_dance, folder, sequence, camera, seconds)
             film()
@@ -235,10 +235,10 @@ def row_of_film(film: Callable[[], Film], ways: Sequence[Way], preset: physical.
         if way == "mujoco_timed":
             way_preset = as_fast(preset, row["larp"]["plan_seconds"] / row["mujoco"]["plan_seconds"])
         reconstruction = reconstruct(keypoints, lifted, names[way], way_preset, seed)
-        row[way] = errors_of(reconstruction.found) | {
+        row[way] = errors_of(reconstruction.executed) | {
             "fell": 100.0 * reconstruction.fell,
-            "plan_seconds": reconstruction.spent.seconds,
-            "ms_per_candidate": 1e3 * reconstruction.spent.seconds / reconstruction.spent.candidates,
+            "plan_seconds": reconstruction.effort.seconds,
+            "ms_per_candidate": 1e3 * reconstruction.effort.seconds / reconstruction.effort.candidates,
         }
     return row
 

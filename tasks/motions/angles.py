@@ -16,13 +16,13 @@ from larp_model.scene import Body, Vector, anchor
 from tasks.motions.skeleton import LIMBS, SIDES, Motion
 
 FIELDS = ("rate", "position", "orientation", "angles")
-RATES = (10.0, 1000.0)
+RATE_RANGE = (10.0, 1000.0)
 
 
 class _ChildJoint(NamedTuple):
     """Joint with the link that it carries.
 
-    parent: row of the parent joint. offset: from the parent's joint [m], in the parent link's frame. turn: rotation
+    parent: row of the parent joint. offset: from the parent's joint [m], in the parent link's frame. to_rest: rotation
     to the T-pose.
     """
 
@@ -30,7 +30,7 @@ class _ChildJoint(NamedTuple):
     link: int
     parent: int
     offset: np.ndarray
-    turn: Rotation
+    to_rest: Rotation
 
 
 def load(path: str | Path) -> Motion:
@@ -39,15 +39,15 @@ def load(path: str | Path) -> Motion:
     require_file("path", path)
     try:
         with np.load(path, allow_pickle=False) as file:
-            given = dict(file)
+            arrays = dict(file)
     except (ValueError, OSError, EOFError, BadZipFile):
         raise InputError(f"{path.name} is no npz file of numbers and names") from None
-    if missing := [name for name in FIELDS if name not in given]:
+    if missing := [name for name in FIELDS if name not in arrays]:
         raise InputError(f"{path.name} has no {', '.join(missing)}: it needs {', '.join(FIELDS)}")
-    names = given.get("joints")
+    names = arrays.get("joints")
     joints = None if names is None else [str(name) for name in np.atleast_1d(names)]
     try:
-        return motion(given["rate"], given["position"], given["orientation"], given["angles"], joints)
+        return motion(arrays["rate"], arrays["position"], arrays["orientation"], arrays["angles"], joints)
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from None
 
@@ -68,7 +68,7 @@ def motion(
     """
     body = human()
     names = [body.links[child].name for child, _, _ in body.motors]
-    rate, position, orientation, angles = (np.asarray(each, float) for each in (rate, position, orientation, angles))
+    rate, position, orientation, angles = (np.asarray(value, float) for value in (rate, position, orientation, angles))
     frames, count = len(position) if position.ndim else 0, len(names)
     for name, value, shape in (
         ("rate", rate, ()),
@@ -77,22 +77,22 @@ def motion(
         ("angles", angles, (frames, count, 3)),
     ):
         if value.shape != shape or not frames:
-            wanted = {"rate": "()", "position": "(T, 3)", "orientation": "(T, 4)", "angles": f"(T, {count}, 3)"}[name]
-            raise InputError(f"{name} has shape {value.shape}, but needs {wanted}, the same T in all")
+            needed = {"rate": "()", "position": "(T, 3)", "orientation": "(T, 4)", "angles": f"(T, {count}, 3)"}[name]
+            raise InputError(f"{name} has shape {value.shape}, but needs {needed}, the same T in all")
         if not np.isfinite(value).all():
             raise InputError(f"{name} holds numbers that are not finite")
-    if not RATES[0] <= rate <= RATES[1]:
-        raise InputError(f"rate is {rate:g}, but must be from {RATES[0]:g} to {RATES[1]:g} frames a second")
+    if not RATE_RANGE[0] <= rate <= RATE_RANGE[1]:
+        raise InputError(f"rate is {rate:g}, but must be from {RATE_RANGE[0]:g} to {RATE_RANGE[1]:g} frames a second")
     if abs(np.linalg.norm(orientation, axis=-1) - 1.0).max() > 1e-3:
         raise InputError("orientation holds quaternions that are not of length 1")
     if joints is not None:
         if sorted(joints) != sorted(names):
             raise InputError(f"joints are {', '.join(joints)}, but must be {', '.join(names)}, in any order")
         angles = angles[:, [joints.index(name) for name in names]]
-    return _of_links(body, float(rate), position, _link_rotations(body, orientation, angles))
+    return _motion_of_links(body, float(rate), position, _link_rotations(body, orientation, angles))
 
 
-def _anchor(body: Body, point: Vector, link: int) -> np.ndarray:
+def _joint_anchor(body: Body, point: Vector, link: int) -> np.ndarray:
     """Return a joint's anchor (3,) [m] in the frame of a link of the body."""
     length, radius, _ = body.sizes[link]
     return anchor(point, np.array(length), np.array(radius), body.links[link].axis)
@@ -100,40 +100,44 @@ def _anchor(body: Body, point: Vector, link: int) -> np.ndarray:
 
 def _link_rotations(body: Body, orientation: np.ndarray, angles: np.ndarray) -> list[Rotation]:
     """Return the world orientations of the links in all frames."""
-    motors = {child: row for row, (child, _, _) in enumerate(body.motors)}
-    found = [Rotation.from_quat(orientation, scalar_first=True)]
+    motor_rows = {child: row for row, (child, _, _) in enumerate(body.motors)}
+    rotations = [Rotation.from_quat(orientation, scalar_first=True)]
     for child, joint in enumerate(body.joints, start=1):
-        found.append(found[joint.parent] * Rotation.from_rotvec(angles[:, motors[child]]))
-    return found
+        rotations.append(rotations[joint.parent] * Rotation.from_rotvec(angles[:, motor_rows[child]]))
+    return rotations
 
 
-def _of_links(body: Body, rate: float, position: np.ndarray, turned: list[Rotation]) -> Motion:
+def _motion_of_links(body: Body, rate: float, position: np.ndarray, rotations: list[Rotation]) -> Motion:
     """Return the motion with joints at the human's, their frames parallel to the world's in a T-pose."""
-    level = {  # rotation of hanging arms to a T-pose's
+    to_t_pose = {  # rotation of hanging arms to a T-pose's
         side: Rotation.from_rotvec((0.5 * np.pi * (1.0 if side == "Left" else -1.0), 0.0, 0.0)) for side in SIDES
     }
     links = {link.name: row for row, link in enumerate(body.links)}
-    none = Rotation.identity()
-    rows = [_ChildJoint("Hips", 0, -1, np.zeros(3), none)]
-    place = {"Hips": 0}
+    unturned = Rotation.identity()
+    rows = [_ChildJoint("Hips", 0, -1, np.zeros(3), unturned)]
+    row_of = {"Hips": 0}
 
-    def add(name: str, link: int, parent: str, offset: np.ndarray, turn: Rotation) -> None:
-        place[name] = len(rows)
-        rows.append(_ChildJoint(name, link, place[parent], offset, turn))
+    def add(name: str, link: int, parent: str, offset: np.ndarray, to_rest: Rotation) -> None:
+        row_of[name] = len(rows)
+        rows.append(_ChildJoint(name, link, row_of[parent], offset, to_rest))
 
-    def between(link: int) -> np.ndarray:
+    def joint_offset(link: int) -> np.ndarray:
         """Return the vector from the parent's joint to the link's own joint, in the parent link's frame."""
         joint = body.joints[link - 1]
-        begin = _anchor(body, body.joints[joint.parent - 1].child_anchor, joint.parent) if joint.parent else np.zeros(3)
-        return _anchor(body, joint.parent_anchor, joint.parent) - begin
+        own_joint = (
+            _joint_anchor(body, body.joints[joint.parent - 1].child_anchor, joint.parent)
+            if joint.parent
+            else np.zeros(3)
+        )
+        return _joint_anchor(body, joint.parent_anchor, joint.parent) - own_joint
 
-    def tip(link: int, along: np.ndarray) -> np.ndarray:
+    def end_offset(link: int, direction: np.ndarray) -> np.ndarray:
         """Return the vector from the link's joint to one end of its axis, in the link's frame."""
-        size = body.links[link].length
-        return 0.5 * size * along - _anchor(body, body.joints[link - 1].child_anchor, link)
+        length = body.links[link].length
+        return 0.5 * length * direction - _joint_anchor(body, body.joints[link - 1].child_anchor, link)
 
-    add("Spine", links["torso"], "Hips", between(links["torso"]), none)
-    add("Head", links["head"], "Spine", between(links["head"]), none)
+    add("Spine", links["torso"], "Hips", joint_offset(links["torso"]), unturned)
+    add("Head", links["head"], "Spine", joint_offset(links["head"]), unturned)
     for side in SIDES:
         parents = {
             "Arm": "Spine",
@@ -143,18 +147,18 @@ def _of_links(body: Body, rate: float, position: np.ndarray, turned: list[Rotati
             "Foot": f"{side}Leg",
         }
         for segment, name in LIMBS.items():
-            link, turn = links[f"{side.lower()}_{segment}"], level[side] if "arm" in segment else none
-            add(side + name, link, parents[name], between(link), turn)
+            link, to_rest = links[f"{side.lower()}_{segment}"], to_t_pose[side] if "arm" in segment else unturned
+            add(side + name, link, parents[name], joint_offset(link), to_rest)
             if name == "ForeArm":
-                add(f"{side}Hand", link, side + name, tip(link, np.array([0.0, 0.0, -1.0])), turn)
+                add(f"{side}Hand", link, side + name, end_offset(link, np.array([0.0, 0.0, -1.0])), to_rest)
             if name == "Foot":
-                add(f"{side}ToeBase", link, side + name, tip(link, np.array([1.0, 0.0, 0.0])), turn)
+                add(f"{side}ToeBase", link, side + name, end_offset(link, np.array([1.0, 0.0, 0.0])), to_rest)
     positions, offsets = [position], [np.zeros(3)]
     for joint in rows[1:]:
         parent = rows[joint.parent]
-        positions.append(positions[joint.parent] + turned[parent.link].apply(joint.offset))
-        offsets.append(parent.turn.apply(joint.offset))
-    orientations = [(turned[joint.link] * joint.turn.inv()).as_quat(scalar_first=True) for joint in rows]
+        positions.append(positions[joint.parent] + rotations[parent.link].apply(joint.offset))
+        offsets.append(parent.to_rest.apply(joint.offset))
+    orientations = [(rotations[joint.link] * joint.to_rest.inv()).as_quat(scalar_first=True) for joint in rows]
     return Motion(
         tuple(joint.name for joint in rows),
         np.array([joint.parent for joint in rows]),

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from larp_model.errors import InputError
 from larp_model.names import require_file
-from tasks.motions.rest_pose import resting
+from tasks.motions.rest_pose import rest_orientations
 from tasks.motions.skeleton import NEEDED, SIDES, Motion, bone, facing, is_t_pose
 
 # The bones of the Carnegie Mellon database's own ASF files, each named at the joint where it begins.
@@ -46,7 +46,7 @@ UNITS = (0.0254 / 0.45, 0.01, 1.0)
 LEG_LENGTH = (0.6, 1.2)
 _OURS = {"X": "Y", "Y": "Z", "Z": "X"}  # our axis for each of a file's axes; positions are reordered accordingly
 _TO_OURS, _TO_FILE = [2, 0, 1], [1, 2, 0]
-_TURNS = ("Zrotation", "Xrotation", "Yrotation")
+_ROTATION_CHANNELS = ("Zrotation", "Xrotation", "Yrotation")
 _LARGEST = 1e6
 _PREFIX = re.compile(r"^(.*:|mixamorig\d*_)")  # of a whole skeleton, as in mixamorig:Hips
 
@@ -64,7 +64,7 @@ def load(path: str | Path, names: Mapping[str, str] | None = None) -> Motion:
     tables = list(SKELETONS.values()) if names is None else [_table(names)]
     try:
         joints, duration, data = _parse(path.read_bytes().decode("ascii", "replace").splitlines())
-        return _motion(_named(joints, tables), duration, data)
+        return _motion_in_metres(_renamed(joints, tables), duration, data)
     except InputError as error:
         raise InputError(f"{path.name} {error}") from None
 
@@ -79,28 +79,35 @@ def dumps(motion: Motion) -> str:
     order: list[int] = []
     lines = ["HIERARCHY"]
 
-    def place(offset: np.ndarray) -> str:
+    def offset_line(offset: np.ndarray) -> str:
         return "OFFSET " + " ".join(f"{100.0 * value + 0.0:.6f}" for value in offset[_TO_FILE])
 
-    def add(row: int, depth: int) -> None:
+    def add_joint(row: int, depth: int) -> None:
         order.append(row)
         margin, root = "  " * depth, motion.parents[row] < 0
-        moved = "6 Xposition Yposition Zposition" if root else "3"
+        channel_list = "6 Xposition Yposition Zposition" if root else "3"
         lines.extend((f"{margin}{'ROOT' if root else 'JOINT'} {motion.names[row]}", margin + "{"))
-        lines.extend((f"{margin}  {place(motion.offsets[row])}", f"{margin}  CHANNELS {moved} {' '.join(_TURNS)}"))
+        lines.extend(
+            (
+                f"{margin}  {offset_line(motion.offsets[row])}",
+                f"{margin}  CHANNELS {channel_list} {' '.join(_ROTATION_CHANNELS)}",
+            )
+        )
         for child in children[row]:
-            add(int(child), depth + 1)
+            add_joint(int(child), depth + 1)
         if not len(children[row]):
-            end = motion.offsets[row] / max(float(np.linalg.norm(motion.offsets[row])), 1e-9)
-            lines.extend((f"{margin}  End Site", margin + "  {", f"{margin}    {place(0.05 * end)}", margin + "  }"))
+            direction = motion.offsets[row] / max(float(np.linalg.norm(motion.offsets[row])), 1e-9)
+            lines.extend(
+                (f"{margin}  End Site", margin + "  {", f"{margin}    {offset_line(0.05 * direction)}", margin + "  }")
+            )
         lines.append(margin + "}")
 
-    add(0, 0)
+    add_joint(0, 0)
     columns = [100.0 * motion.positions[:, 0, _TO_FILE]]
     for row in order:
-        turned, parent = motion.rotation(motion.names[row]), motion.parents[row]
-        local = motion.rotation(motion.names[parent]).inv() * turned if parent >= 0 else turned
-        columns.append(local.as_euler("".join(_OURS[turn[0]] for turn in _TURNS), degrees=True))
+        rotation, parent = motion.rotation(motion.names[row]), motion.parents[row]
+        local = motion.rotation(motion.names[parent]).inv() * rotation if parent >= 0 else rotation
+        columns.append(local.as_euler("".join(_OURS[channel[0]] for channel in _ROTATION_CHANNELS), degrees=True))
     lines += ["MOTION", f"Frames: {len(motion.positions)}", f"Frame Time: {1.0 / motion.rate:.8f}"]
     lines += [" ".join(f"{value + 0.0:.6f}" for value in frame) for frame in np.concatenate(columns, axis=1)]
     return "\n".join(lines) + "\n"
@@ -110,12 +117,12 @@ def names_in(path: Path) -> dict[str, str]:
     """Return the table of joint names in a JSON file, for `load`."""
     require_file("names", path)
     try:
-        found = json.loads(path.read_bytes())
+        names = json.loads(path.read_bytes())
     except ValueError:
         raise InputError(f"names: {path.name} is no JSON file") from None
-    if not (isinstance(found, dict) and all(isinstance(each, str) for each in found.values())):
+    if not (isinstance(names, dict) and all(isinstance(name, str) for name in names.values())):
         raise InputError(f'names: {path.name} needs an object such as {{"Hips": "pelvis", "LeftLeg": "l_knee"}}')
-    return found
+    return names
 
 
 def _table(names: Mapping[str, str]) -> dict[str, str]:
@@ -124,21 +131,21 @@ def _table(names: Mapping[str, str]) -> dict[str, str]:
         raise InputError(f"names has {', '.join(unknown)}, but needs a file's names of {', '.join(NEEDED)}")
     table = {name: _PREFIX.sub("", names.get(name, name)) for name in NEEDED}
     if len(set(table.values())) < len(table):
-        twice = next(theirs for theirs in table.values() if list(table.values()).count(theirs) > 1)
-        ours = " and ".join(name for name, theirs in table.items() if theirs == twice)
-        raise InputError(f"names has {twice!r} for {ours}, but needs another joint for each")
+        repeated = next(file_name for file_name in table.values() if list(table.values()).count(file_name) > 1)
+        our_names = " and ".join(name for name, file_name in table.items() if file_name == repeated)
+        raise InputError(f"names has {repeated!r} for {our_names}, but needs another joint for each")
     return table
 
 
 @dataclass(frozen=True)
-class _Joint:
+class _FileJoint:
     name: str
     parent: int
     offset: list[float]
     channels: list[str]
 
 
-def _parse(lines: list[str]) -> tuple[list[_Joint], float, np.ndarray]:
+def _parse(lines: list[str]) -> tuple[list[_FileJoint], float, np.ndarray]:
     """Return the joints, seconds per frame and channels (T, C) of a file, in its own unit and axes."""
     rows = [(number, line.split()) for number, line in enumerate(lines, start=1) if line.strip()]
     start = next((index for index, (_, words) in enumerate(rows) if words == ["MOTION"]), None)
@@ -171,122 +178,131 @@ def _numbers(words: list[str], count: int, place: str) -> list[float]:
     return values
 
 
-def _hierarchy(words: Iterator[str]) -> list[_Joint]:
+def _hierarchy(words: Iterator[str]) -> list[_FileJoint]:
     """Return the tree of joints, parents first; end sites are read and left out."""
-    joints: list[_Joint] = []
-    line: list[int] = []
+    joints: list[_FileJoint] = []
+    ancestors: list[int] = []
 
-    def need(*wanted: str) -> None:
-        for word in wanted:
-            if (found := next(words, "its end")) != word:
-                raise InputError(f"has {found[:40]!r} in its HIERARCHY, but needs {word!r} there")
+    def expect(*expected: str) -> None:
+        for word in expected:
+            if (actual := next(words, "its end")) != word:
+                raise InputError(f"has {actual[:40]!r} in its HIERARCHY, but needs {word!r} there")
 
     for word in words:
-        if word == "}" and line:
-            line.pop()
-        elif word == "End" and line:
-            need("Site", "{", "OFFSET")
+        if word == "}" and ancestors:
+            ancestors.pop()
+        elif word == "End" and ancestors:
+            expect("Site", "{", "OFFSET")
             _numbers(list(islice(words, 3)), 3, "has an End Site that")
-            need("}")
-        elif word == ("JOINT" if line else "ROOT") and (line or not joints):
+            expect("}")
+        elif word == ("JOINT" if ancestors else "ROOT") and (ancestors or not joints):
             name = _PREFIX.sub("", next(words, ""))
-            need("{", "OFFSET")
+            expect("{", "OFFSET")
             offset = _numbers(list(islice(words, 3)), 3, f"has a joint, {name}, that")
-            need("CHANNELS")
+            expect("CHANNELS")
             count = next(words, "")
-            kinds = ("rotation",) if line and count != "6" else ("position", "rotation")
-            wanted = [axis + kind for kind in kinds for axis in "XYZ"]
-            channels = list(islice(words, len(wanted)))
-            if count != str(len(wanted)) or sorted(channels) != sorted(wanted):
-                raise InputError(f"has a joint, {name}, with other channels than {', '.join(wanted)}, each once")
-            joints.append(_Joint(name, line[-1] if line else -1, offset, channels))
-            line.append(len(joints) - 1)
+            kinds = ("rotation",) if ancestors and count != "6" else ("position", "rotation")
+            expected = [axis + kind for kind in kinds for axis in "XYZ"]
+            channels = list(islice(words, len(expected)))
+            if count != str(len(expected)) or sorted(channels) != sorted(expected):
+                raise InputError(f"has a joint, {name}, with other channels than {', '.join(expected)}, each once")
+            joints.append(_FileJoint(name, ancestors[-1] if ancestors else -1, offset, channels))
+            ancestors.append(len(joints) - 1)
         else:
             raise InputError(f"has {word[:40]!r} in its HIERARCHY, where it does not belong")
     names = [joint.name for joint in joints]
-    if line or len(set(names)) != len(names):
-        raise InputError("has a HIERARCHY with " + ("braces left open" if line else "two joints of one name"))
+    if ancestors or len(set(names)) != len(names):
+        raise InputError("has a HIERARCHY with " + ("braces left open" if ancestors else "two joints of one name"))
     return joints
 
 
-def _named(joints: list[_Joint], tables: list[dict[str, str]]) -> list[_Joint]:
+def _renamed(joints: list[_FileJoint], tables: list[dict[str, str]]) -> list[_FileJoint]:
     """Return the joints, the needed ones renamed to ours by the first table with the fewest missing."""
-    found = [joint.name for joint in joints]
-    table = min(tables, key=lambda table: len(set(table.values()) - set(found)))
-    if missing := {ours: theirs for ours, theirs in table.items() if theirs not in found}:
+    file_names = [joint.name for joint in joints]
+    table = min(tables, key=lambda table: len(set(table.values()) - set(file_names)))
+    if missing := {our_name: file_name for our_name, file_name in table.items() if file_name not in file_names}:
         raise InputError(
             f"has no joints {', '.join(missing.values())}, but needs them, or names that say what it calls"
-            f" {', '.join(missing)}: it has {shorten(', '.join(found), 600)}"
+            f" {', '.join(missing)}: it has {shorten(', '.join(file_names), 600)}"
         )
-    ours = {theirs: name for name, theirs in table.items()}
+    our_name = {file_name: name for name, file_name in table.items()}
     # Another joint of the file may have a name that is one of ours.
     return [
-        replace(joint, name=ours.get(joint.name, f"{joint.name} (other)" if joint.name in NEEDED else joint.name))
+        replace(joint, name=our_name.get(joint.name, f"{joint.name} (other)" if joint.name in NEEDED else joint.name))
         for joint in joints
     ]
 
 
-def _motion(joints: list[_Joint], duration: float, data: np.ndarray) -> Motion:
+def _motion_in_metres(joints: list[_FileJoint], duration: float, data: np.ndarray) -> Motion:
     """Return the motion of all frames, in metres, with joint frames made parallel in the rest pose."""
-    poses = np.concatenate([_unturned(joints)[None], data])
-    raw = _posed(joints, duration, poses)
-    thighs, shins = ([bone(raw, side + joint)[0] for side in SIDES] for joint in ("UpLeg", "Leg"))
-    legs = float(np.linalg.norm(thighs, axis=-1).mean() + np.linalg.norm(shins, axis=-1).mean())
-    unit = next((unit for unit in UNITS if LEG_LENGTH[0] <= unit * legs <= LEG_LENGTH[1]), None)
+    channels = np.concatenate([_unrotated(joints)[None], data])
+    unscaled = _forward_kinematics(joints, duration, channels)
+    thighs, shins = ([bone(unscaled, side + joint)[0] for side in SIDES] for joint in ("UpLeg", "Leg"))
+    leg_length = float(np.linalg.norm(thighs, axis=-1).mean() + np.linalg.norm(shins, axis=-1).mean())
+    unit = next((unit for unit in UNITS if LEG_LENGTH[0] <= unit * leg_length <= LEG_LENGTH[1]), None)
     if unit is None:
-        raise InputError(f"has legs {legs:.3g} units long, but needs 0.6 to 1.2 m in units of 0.0254/0.45 m, cm or m")
-    if raw.chest == raw.names[0]:
+        raise InputError(
+            f"has legs {leg_length:.3g} units long, but needs 0.6 to 1.2 m in units of 0.0254/0.45 m, cm or m"
+        )
+    if unscaled.chest == unscaled.names[0]:
         raise InputError("has no chest: its arms branch off the root")
-    rest = next((pose for pose in (1, 0) if is_t_pose(raw, pose)), None)
-    if rest is None:
-        turns, rest = resting(raw.cut(1, len(poses))), 0
+    rest_frame = next((pose for pose in (1, 0) if is_t_pose(unscaled, pose)), None)
+    if rest_frame is None:
+        rest, rest_frame = rest_orientations(unscaled.cut(1, len(channels))), 0
     else:
-        turns = facing(raw, rest) * Rotation.from_quat(raw.orientations[rest], scalar_first=True)
-    if len(poses) == 1 + rest:
+        rest = facing(unscaled, rest_frame) * Rotation.from_quat(unscaled.orientations[rest_frame], scalar_first=True)
+    if len(channels) == 1 + rest_frame:
         raise InputError("has no frames but the T-pose")
 
-    offsets = np.zeros_like(raw.offsets)
-    offsets[1:] = turns[raw.parents[1:]].apply(raw.offsets[1:])
-    moved = Rotation.from_quat(raw.orientations[1 + rest :].reshape(-1, 4), scalar_first=True)
-    frames = len(poses) - 1 - rest
-    back = Rotation.concatenate([turns.inv()] * frames)
-    orientations = (moved * back).as_quat(scalar_first=True).reshape(frames, -1, 4)
-    return replace(raw, offsets=unit * offsets, positions=unit * raw.positions[1 + rest :], orientations=orientations)
+    offsets = np.zeros_like(unscaled.offsets)
+    offsets[1:] = rest[unscaled.parents[1:]].apply(unscaled.offsets[1:])
+    rotations = Rotation.from_quat(unscaled.orientations[1 + rest_frame :].reshape(-1, 4), scalar_first=True)
+    frames = len(channels) - 1 - rest_frame
+    from_rest = Rotation.concatenate([rest.inv()] * frames)
+    orientations = (rotations * from_rest).as_quat(scalar_first=True).reshape(frames, -1, 4)
+    return replace(
+        unscaled,
+        offsets=unit * offsets,
+        positions=unit * unscaled.positions[1 + rest_frame :],
+        orientations=orientations,
+    )
 
 
-def _unturned(joints: list[_Joint]) -> np.ndarray:
+def _unrotated(joints: list[_FileJoint]) -> np.ndarray:
     """Return the channels (C,) of the pose without rotations; joints that have positions are at their offsets."""
-    found = []
+    values = []
     for joint in joints:
         offset = dict(zip("XYZ", joint.offset if joint.parent >= 0 else (0.0, 0.0, 0.0), strict=True))
-        found += [offset[channel[0]] if channel.endswith("position") else 0.0 for channel in joint.channels]
-    return np.array(found)
+        values += [offset[channel[0]] if channel.endswith("position") else 0.0 for channel in joint.channels]
+    return np.array(values)
 
 
-def _posed(joints: list[_Joint], duration: float, poses: np.ndarray) -> Motion:
+def _forward_kinematics(joints: list[_FileJoint], duration: float, poses: np.ndarray) -> Motion:
     """Return the motion of channels (P, C) by forward kinematics, in our axes but the file's unit and joint frames."""
-    turns: list[Rotation] = []
-    places: list[np.ndarray] = []
+    rotations: list[Rotation] = []
+    positions: list[np.ndarray] = []
     column = 0
     for joint in joints:
         channels = dict(zip(joint.channels, poses.T[column : column + len(joint.channels)], strict=True))
         column += len(joint.channels)
-        order = [channel for channel in joint.channels if channel.endswith("rotation")]
-        angles = np.stack([channels[channel] for channel in order], axis=-1)
-        turn = Rotation.from_euler("".join(_OURS[channel[0]] for channel in order), angles, degrees=True)
+        rotation_channels = [channel for channel in joint.channels if channel.endswith("rotation")]
+        angles = np.stack([channels[channel] for channel in rotation_channels], axis=-1)
+        rotation = Rotation.from_euler(
+            "".join(_OURS[channel[0]] for channel in rotation_channels), angles, degrees=True
+        )
         offset = np.array(joint.offset)[_TO_OURS]
-        place = np.stack([channels[f"{axis}position"] for axis in "ZXY"], axis=-1) if len(channels) > 3 else offset
+        position = np.stack([channels[f"{axis}position"] for axis in "ZXY"], axis=-1) if len(channels) > 3 else offset
         if joint.parent < 0:
-            places.append(offset + place)
-            turns.append(turn)
+            positions.append(offset + position)
+            rotations.append(rotation)
         else:
-            places.append(places[joint.parent] + turns[joint.parent].apply(place))
-            turns.append(turns[joint.parent] * turn)
+            positions.append(positions[joint.parent] + rotations[joint.parent].apply(position))
+            rotations.append(rotations[joint.parent] * rotation)
     return Motion(
         tuple(joint.name for joint in joints),
         np.array([joint.parent for joint in joints]),
         np.array([joint.offset for joint in joints])[:, _TO_OURS],
         1.0 / duration,
-        np.stack(places, axis=1),
-        np.stack([turn.as_quat(scalar_first=True) for turn in turns], axis=1),
+        np.stack(positions, axis=1),
+        np.stack([rotation.as_quat(scalar_first=True) for rotation in rotations], axis=1),
     )

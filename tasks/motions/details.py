@@ -16,11 +16,11 @@ def in_detail(body: Body, targets: np.ndarray) -> np.ndarray:
     """
     if detail_of(body) == "lean":
         return targets
-    lean, found = human(), np.zeros((*targets.shape[:-2], len(body.motors), 3))
+    lean, detailed = human(), np.zeros((*targets.shape[:-2], len(body.motors), 3))
     rows = {body.links[child].name: row for row, (child, _, _) in enumerate(body.motors)}
     for row, (child, _, _) in enumerate(lean.motors):
         name = lean.links[child].name
         chain = CHAINS.get(name, (name,))
-        for each in chain:
-            found[..., rows[each], :] = targets[..., row, :] / len(chain)
-    return found
+        for link in chain:
+            detailed[..., rows[link], :] = targets[..., row, :] / len(chain)
+    return detailed

@@ -37,13 +37,15 @@ class KeyPoses:
 
     def controls(self, body: Body, steps: int, dt: float) -> np.ndarray:
         """Return the body's joint targets (steps, J, 3) [rad], monotone between key poses, constant after the last."""
-        lean = human()
-        names = [lean.links[child].name for child, _, _ in lean.motors]
+        lean_human = human()
+        names = [lean_human.links[child].name for child, _, _ in lean_human.motors]
         times = np.minimum(np.arange(steps) * dt, self.times[-1])
         controls = np.zeros((steps, len(names), 3))
         for (joint, axis), angles in self.angles.items():
             controls[:, names.index(joint), axis] = PchipInterpolator(self.times, angles)(times)
-        lower, upper = (np.array([getattr(motor, end) for _, _, motor in body.motors]) for end in ("lower", "upper"))
+        lower, upper = (
+            np.array([getattr(motor, bound) for _, _, motor in body.motors]) for bound in ("lower", "upper")
+        )
         return np.clip(in_detail(body, controls), lower, upper)
 
 

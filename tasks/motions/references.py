@@ -23,9 +23,9 @@ from tasks.motions.skeleton import Motion
 from tasks.motions.tracking import Tracker
 
 # Steps around the strike in which a captured kick may hit its ball.
-MEETING = 10
+STRIKE_STEPS = 10
 # Least height of the hips above the lower foot at the strike, as a share of the rest pose's.
-STANDING = 0.5
+MIN_HIP_HEIGHT = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,44 +67,47 @@ def standing_on_ground(
     motors = {child: index for index, (child, _, _) in enumerate(human.motors)}
     rotations = [root]
     for child, joint in enumerate(human.joints, start=1):
-        turn = targets[:, motors[child]] if child in motors else np.zeros((count, 3))
-        rotations.append(rotations[joint.parent] * Rotation.from_rotvec(turn))
+        rotation_vector = targets[:, motors[child]] if child in motors else np.zeros((count, 3))
+        rotations.append(rotations[joint.parent] * Rotation.from_rotvec(rotation_vector))
     for row, rotation in enumerate(rotations):
         states[:, row, packed.ORIENTATION] = rotation.as_quat(scalar_first=True)
-    given = human.sizes if morphology is None else morphology[:, : len(human.links)]
-    sizes = np.broadcast_to(given, (count, len(human.links), 3))
-    stood = closed(scene.only(human.name), states[:, : len(human.links)], sizes)
-    stood[..., 2] -= clearance(human, stood, sizes)[:, None]
-    states[:, : len(human.links)] = stood
+    usual = human.sizes if morphology is None else morphology[:, : len(human.links)]
+    sizes = np.broadcast_to(usual, (count, len(human.links), 3))
+    closed_states = closed(scene.only(human.name), states[:, : len(human.links)], sizes)
+    closed_states[..., 2] -= clearance(human, closed_states, sizes)[:, None]
+    states[:, : len(human.links)] = closed_states
     return states
 
 
 def clearance(body: Body, states: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """Return the height (N,) [m] above the ground of a body's lowest link, in states (N, n, 13), sizes (N, n, 3)."""
     return np.min(
-        [states[:, row, 2] - resting(link, states[:, row], sizes[:, row]) for row, link in enumerate(body.links)],
+        [
+            states[:, row, 2] - resting_height(link, states[:, row], sizes[:, row])
+            for row, link in enumerate(body.links)
+        ],
         axis=0,
     )
 
 
-def resting(link: Link, states: np.ndarray, sizes: np.ndarray | None = None) -> np.ndarray:
+def resting_height(link: Link, states: np.ndarray, sizes: np.ndarray | None = None) -> np.ndarray:
     """Return the height (N,) [m] at which a link touches the ground in the orientations of states (N, 13).
 
     sizes: (N, 3) length, radius and mass; the link's by default.
     """
-    turned = Rotation.from_quat(states[:, packed.ORIENTATION], scalar_first=True)
+    rotations = Rotation.from_quat(states[:, packed.ORIENTATION], scalar_first=True)
     length, radius = (link.length, link.radius) if sizes is None else (sizes[:, 0], sizes[:, 1])
-    return radius + 0.5 * length * np.abs(turned.apply(link.axis)[:, 2])
+    return radius + 0.5 * length * np.abs(rotations.apply(link.axis)[:, 2])
 
 
-def starts(scene: Scene, poses: Sequence[KeyPoses]) -> np.ndarray:
+def initial_states(scene: Scene, poses: Sequence[KeyPoses]) -> np.ndarray:
     """Return initial states (N, L, 13) of kicks of key poses; the ball's distance scales with the human's height."""
     human, ball = scene.bodies[0], scene.bodies[-1]
-    size = standing_height(human) / standing_height(bodies.human(detail=bodies.detail_of(human)))
-    first = np.concatenate([each.controls(human, 1, scene.dt) for each in poses])
-    states = standing_on_ground(scene, first, Rotation.from_euler("xy", [each.lean for each in poses]))
-    states[:, : len(human.links), packed.VELOCITY] = np.array([each.velocity for each in poses])[:, None]
-    states[:, -1, packed.POSITION] = [(*(size * np.array(each.ball)), ball.links[0].radius) for each in poses]
+    height_ratio = standing_height(human) / standing_height(bodies.human(detail=bodies.detail_of(human)))
+    first = np.concatenate([pose.controls(human, 1, scene.dt) for pose in poses])
+    states = standing_on_ground(scene, first, Rotation.from_euler("xy", [pose.lean for pose in poses]))
+    states[:, : len(human.links), packed.VELOCITY] = np.array([pose.velocity for pose in poses])[:, None]
+    states[:, -1, packed.POSITION] = [(*(height_ratio * np.array(pose.ball)), ball.links[0].radius) for pose in poses]
     return states
 
 
@@ -114,12 +117,12 @@ def embedded(scene: Scene, steps: int = 300, poses: KeyPoses | None = None) -> R
     The human is the scene's first body, the ball its last.
     """
     poses = key_poses.load() if poses is None else poses
-    controls, state = poses.controls(scene.bodies[0], steps, scene.dt), starts(scene, [poses])[0]
+    controls, state = poses.controls(scene.bodies[0], steps, scene.dt), initial_states(scene, [poses])[0]
     truth = Truth(scene)
-    after, finite = truth.rollout(state[None], controls[None])
-    if not finite[0]:
+    next_states, is_finite = truth.rollout(state[None], controls[None])
+    if not is_finite[0]:
         raise InputError("scene: its human cannot perform the embedded reference kick; the truth diverged")
-    states = np.concatenate([state[None], after[0]])
+    states = np.concatenate([state[None], next_states[0]])
     moving = np.linalg.norm(states[:, -1, packed.VELOCITY], axis=-1) > 0.5
     if not moving.any():
         raise InputError("scene: its human misses the ball in the embedded reference kick")
@@ -162,21 +165,23 @@ def captured(
     frame = skeleton.strike(motion)
     require_kick(path, motion, frame, scene.dt)
     clip = motion.cut(frame - round(seconds_before * motion.rate), frame + round(seconds_after * motion.rate))
-    wanted, controls = _wanted(scene, clip)
-    expected, last = round(skeleton.strike(clip) / clip.rate / scene.dt), len(controls) - 1
-    tracker = Tracker(scene, wanted, _importance(scene, len(wanted), expected), controls)
-    before, targets = tracker.follow(wanted[0], 0, min(expected + MEETING, last))
-    spot, touch = _spot(path, scene, before, expected)
-    before[:, -1, packed.POSITION] = spot
-    after, onwards = tracker.follow(before[touch], touch, last)
-    states = np.concatenate([before[:touch], after])
+    target_states, controls = _retargeted(scene, clip)
+    expected_strike, last = round(skeleton.strike(clip) / clip.rate / scene.dt), len(controls) - 1
+    tracker = Tracker(scene, target_states, _position_weights(scene, len(target_states), expected_strike), controls)
+    states_before, targets_before = tracker.follow(target_states[0], 0, min(expected_strike + STRIKE_STEPS, last))
+    ball_spot, touch_step = _ball_spot(path, scene, states_before, expected_strike)
+    states_before[:, -1, packed.POSITION] = ball_spot
+    states_after, targets_after = tracker.follow(states_before[touch_step], touch_step, last)
+    states = np.concatenate([states_before[:touch_step], states_after])
     if not finite(states[None])[0]:
         raise InputError(f"{path}: the truth diverges when the human performs this kick")
     moving = np.linalg.norm(states[:, -1, packed.VELOCITY], axis=-1) > 0.5
     if not moving.any():
         raise InputError(f"{path}: the human misses the ball when it performs this kick")
     strike = int(moving.argmax()) - 1
-    return Reference(_launched_along_x(states, strike), np.concatenate([targets[:touch], onwards]), strike)
+    return Reference(
+        _launched_along_x(states, strike), np.concatenate([targets_before[:touch_step], targets_after]), strike
+    )
 
 
 def require_kick(path: str | Path, motion: Motion, strike: int, dt: float) -> None:
@@ -184,95 +189,100 @@ def require_kick(path: str | Path, motion: Motion, strike: int, dt: float) -> No
 
     strike: a frame of the motion. dt: the scene's time step [s].
     """
-    before, needed = strike / motion.rate, (MEETING + 1) * dt
-    if before < needed:
+    time_before, time_needed = strike / motion.rate, (STRIKE_STEPS + 1) * dt
+    if time_before < time_needed:
         raise InputError(
-            f"{path} begins {before:.2f} s before its strike, but needs {needed:g} s: the foot must be fastest later"
+            f"{path} begins {time_before:.2f} s before its strike, but needs {time_needed:g} s: "
+            "the foot must be fastest later"
         )
     feet = [motion.path(f"{side}Foot")[strike, 2] for side in skeleton.SIDES]
-    high = motion.path("Hips")[strike, 2] - min(feet)
-    if high < STANDING * motion.hip_height:
+    hip_height = motion.path("Hips")[strike, 2] - min(feet)
+    if hip_height < MIN_HIP_HEIGHT * motion.hip_height:
         raise InputError(
-            f"{path} is no kick of one who stands: at the strike the hips are {high:.2f} m above the lower foot, "
+            f"{path} is no kick of one who stands: at the strike the hips are {hip_height:.2f} m above the lower foot, "
             f"but are {motion.hip_height:.2f} m in the rest pose; is the file's up axis another one?"
         )
 
 
 def _launched_along_x(states: np.ndarray, strike: int) -> np.ndarray:
     """Return the states (T, L, 13), rotated about z and moved along y so that the ball leaves along the x axis."""
-    x, y, _ = states[min(strike + MEETING, len(states) - 1), -1, packed.VELOCITY]
-    turned = turned_about_z(states, -np.arctan2(y, x))
-    turned[..., 1] -= turned[0, -1, 1]
-    return turned
+    x, y, _ = states[min(strike + STRIKE_STEPS, len(states) - 1), -1, packed.VELOCITY]
+    rotated = turned_about_z(states, -np.arctan2(y, x))
+    rotated[..., 1] -= rotated[0, -1, 1]
+    return rotated
 
 
-def _wanted(scene: Scene, clip: Motion) -> tuple[np.ndarray, np.ndarray]:
+def _retargeted(scene: Scene, clip: Motion) -> tuple[np.ndarray, np.ndarray]:
     """Return the clip as states (T, L, 13) and joint targets (T, J, 3) [rad] of the human, the ball out of reach."""
     human, ball = scene.bodies[0], scene.bodies[-1]
-    orientations, lean = skeleton.retarget(clip, bodies.human(), scene.dt)
-    poses = in_detail(human, lean)
+    orientations, usual_targets = skeleton.retarget(clip, bodies.human(), scene.dt)
+    targets = in_detail(human, usual_targets)
     root = Rotation.from_quat(orientations, scalar_first=True)
-    states = standing_on_ground(scene, poses, root)
+    states = standing_on_ground(scene, targets, root)
     rows = scene.rows(human.name)
-    size = standing_height(human) / clip.hip_height
-    way = size * (clip.path("Hips") - clip.path("Hips")[0])
-    times = np.arange(len(way)) / clip.rate
+    height_ratio = standing_height(human) / clip.hip_height
+    hip_displacement = height_ratio * (clip.path("Hips") - clip.path("Hips")[0])
+    times = np.arange(len(hip_displacement)) / clip.rate
     for axis in (0, 1):
-        states[:, rows, axis] += np.interp(np.arange(len(poses)) * scene.dt, times, way[:, axis])[:, None]
+        states[:, rows, axis] += np.interp(np.arange(len(targets)) * scene.dt, times, hip_displacement[:, axis])[
+            :, None
+        ]
     states[:, rows, packed.VELOCITY] = np.gradient(states[:, rows, packed.POSITION], scene.dt, axis=0)
-    states[:, rows] = spinning(states[:, rows], scene.dt)
+    states[:, rows] = with_angular_velocities(states[:, rows], scene.dt)
     states[:, -1, packed.POSITION] = (-50.0, 0.0, ball.links[0].radius)
-    return states, leading(scene, poses)
+    return states, with_servo_lead(scene, targets)
 
 
-def spinning(states: np.ndarray, dt: float) -> np.ndarray:
+def with_angular_velocities(states: np.ndarray, dt: float) -> np.ndarray:
     """Return the states (T, L, 13) with the angular velocities that rotate each link from one step to the next."""
-    spun = states.copy()
+    with_rates = states.copy()
     for row in range(states.shape[1]):
-        turned = Rotation.from_quat(states[:, row, packed.ORIENTATION], scalar_first=True)
-        spin = (turned[1:] * turned[:-1].inv()).as_rotvec() / dt
-        spun[:, row, packed.ANGULAR_VELOCITY] = np.concatenate([spin, spin[-1:]])
-    return spun
+        rotations = Rotation.from_quat(states[:, row, packed.ORIENTATION], scalar_first=True)
+        angular_velocity = (rotations[1:] * rotations[:-1].inv()).as_rotvec() / dt
+        with_rates[:, row, packed.ANGULAR_VELOCITY] = np.concatenate([angular_velocity, angular_velocity[-1:]])
+    return with_rates
 
 
-def leading(scene: Scene, poses: np.ndarray) -> np.ndarray:
+def with_servo_lead(scene: Scene, angles: np.ndarray) -> np.ndarray:
     """Return joint targets (T, J, 3) [rad] that lead the angles by the servos' lag, damping / stiffness."""
     lag = np.array([motor.damping / motor.stiffness for motor in scene.motors])[:, None]
-    return poses + lag * np.gradient(poses, scene.dt, axis=0)
+    return angles + lag * np.gradient(angles, scene.dt, axis=0)
 
 
-def _importance(scene: Scene, steps: int, strike: int) -> np.ndarray:
+def _position_weights(scene: Scene, steps: int, strike: int) -> np.ndarray:
     """Return position weights (T, L) of links: higher for pelvis and feet, highest for the kicking foot at strike."""
     human = scene.bodies[0]
     pelvis, left, right = (scene.index(human.name, link) for link in ("pelvis", "left_foot", "right_foot"))
     weights = np.zeros((steps, len(scene.links)))
     weights[:, scene.rows(human.name)] = 1.0
     weights[:, [pelvis, left, right]] = 5.0
-    weights[max(strike - MEETING, 0) : strike + MEETING, right] = 100.0
+    weights[max(strike - STRIKE_STEPS, 0) : strike + STRIKE_STEPS, right] = 100.0
     return weights
 
 
-def _spot(path: str | Path, scene: Scene, states: np.ndarray, strike: int) -> tuple[np.ndarray, int]:
+def _ball_spot(path: str | Path, scene: Scene, states: np.ndarray, strike: int) -> tuple[np.ndarray, int]:
     """Return the ball's position (3,) [m] just ahead of the right foot, and the step near the strike of the touch."""
     human, radius = scene.bodies[0], scene.bodies[-1].links[0].radius
     foot = human.links[human.link("right_foot")]
-    way = states[:, scene.index(human.name, "right_foot")]
-    height = way[:, 2] - radius
-    speed = np.linalg.norm(way[:, packed.VELOCITY][:, :2], axis=-1)
+    foot_states = states[:, scene.index(human.name, "right_foot")]
+    height = foot_states[:, 2] - radius
+    speed = np.linalg.norm(foot_states[:, packed.VELOCITY][:, :2], axis=-1)
     reach = radius + foot.radius
     # The foot pushes along the line of centres, which its height tilts out of the horizontal.
-    push = speed * np.sqrt(np.maximum(1.0 - (height / reach) ** 2, 0.0))
-    push[abs(np.arange(len(way)) - strike) > MEETING] = 0.0
-    touch = int(push.argmax())
-    if not push[touch] > 0.0:
+    push_speed = speed * np.sqrt(np.maximum(1.0 - (height / reach) ** 2, 0.0))
+    push_speed[abs(np.arange(len(foot_states)) - strike) > STRIKE_STEPS] = 0.0
+    touch_step = int(push_speed.argmax())
+    if not push_speed[touch_step] > 0.0:
         raise InputError(f"{path}: the foot passes {height[strike]:.2f} m above the centre of a ball, and hits none")
 
-    forwards = np.array([*way[touch, packed.VELOCITY][:2], 0.0]) / speed[touch]
-    turn = Rotation.from_quat(way[touch, packed.ORIENTATION], scalar_first=True)
-    along = np.linspace(-0.5, 0.5, 21)[:, None] * foot.length * turn.apply(foot.axis)
+    forwards = np.array([*foot_states[touch_step, packed.VELOCITY][:2], 0.0]) / speed[touch_step]
+    rotation = Rotation.from_quat(foot_states[touch_step, packed.ORIENTATION], scalar_first=True)
+    axis_points = np.linspace(-0.5, 0.5, 21)[:, None] * foot.length * rotation.apply(foot.axis)
     # Points of the foot's axis, from the ball's centre below them; moved ahead, it is out of reach of all of them.
-    apart = along + np.array([0.0, 0.0, height[touch]])
-    ahead = apart @ forwards
-    aside = np.sum(apart**2, axis=-1) - ahead**2
-    distance = np.max(ahead + np.sqrt(np.maximum(reach**2 - aside, 0.0)), where=aside < reach**2, initial=0.0)
-    return np.array([*(way[touch, :2] + distance * forwards[:2]), radius]), touch
+    offsets = axis_points + np.array([0.0, 0.0, height[touch_step]])
+    ahead = offsets @ forwards
+    squared_aside = np.sum(offsets**2, axis=-1) - ahead**2
+    distance = np.max(
+        ahead + np.sqrt(np.maximum(reach**2 - squared_aside, 0.0)), where=squared_aside < reach**2, initial=0.0
+    )
+    return np.array([*(foot_states[touch_step, :2] + distance * forwards[:2]), radius]), touch_step

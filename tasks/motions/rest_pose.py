@@ -15,28 +15,32 @@ from tasks.motions.skeleton import ENDS, SIDES, Motion, bone
 
 FORWARDS, LEFT, UP = np.eye(3)
 # Fewest frames for an estimate. A limb with a smaller mean bend [rad] gives no hinge axis.
-FRAMES, STRAIGHT = 10, 0.05
+MIN_FRAMES, MIN_BEND = 10, 0.05
 
 
-def resting(motion: Motion) -> Rotation:
+def rest_orientations(motion: Motion) -> Rotation:
     """Return orientations of the n joint frames in a T-pose, the person facing x; `motion` is in its file's frames.
 
     Torso and pelvis have the mean lean of the motion, feet are as steep as with the ankle lowest, and all other joints
     (neck, hands, ...) have their mean orientation relative to the parent. Raises an InputError where there are too few
     frames.
     """
-    if len(motion.positions) < FRAMES:
+    if len(motion.positions) < MIN_FRAMES:
         raise InputError(
             "has no rest pose: neither its first frame nor its pose without rotations is a T-pose, and"
-            f" {len(motion.positions)} frames are too few to make one of, it needs {FRAMES}"
+            f" {len(motion.positions)} frames are too few to make one of, it needs {MIN_FRAMES}"
         )
     chest = motion.chest
     rests: list[Rotation] = []
-    hips = across(motion, "Hips", "UpLeg", motion.path(chest) - motion.path("Hips"))
-    shoulders = across(motion, chest, "Arm", motion.path("Head") - motion.path(chest))
+    hips = branching_frame(motion, "Hips", "UpLeg", motion.path(chest) - motion.path("Hips"))
+    shoulders = branching_frame(motion, chest, "Arm", motion.path("Head") - motion.path(chest))
     for name, parent in zip(motion.names, motion.parents, strict=True):
-        own = motion.rotation(name)
-        usual = own.mean() if parent < 0 else rests[parent] * (motion.rotation(motion.names[parent]).inv() * own).mean()
+        rotations = motion.rotation(name)
+        usual = (
+            rotations.mean()
+            if parent < 0
+            else rests[parent] * (motion.rotation(motion.names[parent]).inv() * rotations).mean()
+        )
         side = next((side for side in SIDES if name.startswith(side)), "")
         part = name.removeprefix(side)
         if name == "Hips":
@@ -44,69 +48,81 @@ def resting(motion: Motion) -> Rotation:
         elif name == chest:
             rests.append(shoulders)
         elif side and part in ENDS:
-            rests.append(limb(motion, side, part, usual))
+            rests.append(limb_frame(motion, side, part, usual))
         elif side and part == "Foot":
-            rests.append(foot(motion, side, usual))
+            rests.append(foot_frame(motion, side, usual))
         else:
             rests.append(usual)
     return Rotation.concatenate(rests)
 
 
-def across(motion: Motion, name: str, limbs: str, upwards: np.ndarray) -> Rotation:
+def branching_frame(motion: Motion, name: str, limbs: str, upwards: np.ndarray) -> Rotation:
     """Return the frame of a joint from which limbs branch off to left and right.
 
     upwards: (T, 3) vectors that the frame makes point up as far as it can.
     """
-    back = motion.rotation(name).inv()
+    to_joint_frame = motion.rotation(name).inv()
     sideways = motion.path(f"Left{limbs}") - motion.path(f"Right{limbs}")
-    return turned((mean(back, sideways), LEFT), (mean(back, upwards), UP))
+    return aligned(
+        (mean_in_joint_frame(to_joint_frame, sideways), LEFT), (mean_in_joint_frame(to_joint_frame, upwards), UP)
+    )
 
 
-def limb(motion: Motion, side: str, part: str, usual: Rotation) -> Rotation:
+def limb_frame(motion: Motion, side: str, part: str, usual: Rotation) -> Rotation:
     """Return the frame of a limb's joint whose bone points down, or to its side if it is an arm's."""
     outwards = LEFT if side == "Left" else -LEFT
     arm = "Arm" in part
-    along = mean(motion.rotation(side + part).inv(), bone(motion, side + part)), outwards if arm else -UP
-    axis = hinge(motion, side, part, arm)
-    if np.linalg.norm(axis) < STRAIGHT:
-        return turned((usual.apply(along[0]), along[1])) * usual
-    return turned(along, (axis, np.cross(outwards, FORWARDS) if arm else LEFT))
+    bone_pair = (
+        mean_in_joint_frame(motion.rotation(side + part).inv(), bone(motion, side + part)),
+        outwards if arm else -UP,
+    )
+    axis = hinge_axis(motion, side, part, arm)
+    if np.linalg.norm(axis) < MIN_BEND:
+        return aligned((usual.apply(bone_pair[0]), bone_pair[1])) * usual
+    return aligned(bone_pair, (axis, np.cross(outwards, FORWARDS) if arm else LEFT))
 
 
-def foot(motion: Motion, side: str, usual: Rotation) -> Rotation:
+def foot_frame(motion: Motion, side: str, usual: Rotation) -> Rotation:
     """Return the frame of a foot's joint, the foot as steep as with the ankle lowest.
 
     The toes are lowest at another time, when they push off.
     """
     ankle = motion.path(f"{side}Foot")
-    way, height = motion.path(f"{side}ToeBase") - ankle, ankle[:, 2]
-    fall = np.median((-way[:, 2] / np.linalg.norm(way, axis=-1))[height <= np.quantile(height, 0.25)])
-    fall = float(np.clip(fall, -0.9, 0.9))
-    along = mean(motion.rotation(f"{side}Foot").inv(), way), np.sqrt(1.0 - fall**2) * FORWARDS - fall * UP
-    axis = hinge(motion, side, "Foot", arm=False)
-    if np.linalg.norm(axis) < STRAIGHT:
-        return turned((usual.apply(along[0]), along[1])) * usual
-    return turned(along, (axis, LEFT))
+    ankle_to_toe, height = motion.path(f"{side}ToeBase") - ankle, ankle[:, 2]
+    descent = np.median(
+        (-ankle_to_toe[:, 2] / np.linalg.norm(ankle_to_toe, axis=-1))[height <= np.quantile(height, 0.25)]
+    )
+    descent = float(np.clip(descent, -0.9, 0.9))
+    bone_pair = (
+        mean_in_joint_frame(motion.rotation(f"{side}Foot").inv(), ankle_to_toe),
+        np.sqrt(1.0 - descent**2) * FORWARDS - descent * UP,
+    )
+    axis = hinge_axis(motion, side, "Foot", arm=False)
+    if np.linalg.norm(axis) < MIN_BEND:
+        return aligned((usual.apply(bone_pair[0]), bone_pair[1])) * usual
+    return aligned(bone_pair, (axis, LEFT))
 
 
-def hinge(motion: Motion, side: str, part: str, arm: bool) -> np.ndarray:
+def hinge_axis(motion: Motion, side: str, part: str, arm: bool) -> np.ndarray:
     """Return the axis (3,) of knee or elbow in the frame of a limb's joint; its length is the mean bend [rad]."""
     upper, lower = (bone(motion, side + name) for name in (("Arm", "ForeArm") if arm else ("UpLeg", "Leg")))
     bent = np.cross(upper, lower) / (np.linalg.norm(upper, axis=-1) * np.linalg.norm(lower, axis=-1))[:, None]
-    return mean(motion.rotation(side + part).inv(), bent)
+    return mean_in_joint_frame(motion.rotation(side + part).inv(), bent)
 
 
-def mean(back: Rotation, vectors: np.ndarray) -> np.ndarray:
-    """Return the mean (3,) of world vectors (T, 3) in a joint's frame; back: rotations from world to joint frame."""
-    return back.apply(vectors).mean(axis=0)
+def mean_in_joint_frame(to_joint_frame: Rotation, vectors: np.ndarray) -> np.ndarray:
+    """Return the mean (3,) in a joint's frame of world vectors (T, 3); to_joint_frame: T rotations from the world."""
+    return to_joint_frame.apply(vectors).mean(axis=0)
 
 
-def turned(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray] | None = None) -> Rotation:
+def aligned(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray] | None = None) -> Rotation:
     """Return the rotation that takes a vector to the direction of another, and a second pair as near as it then can.
 
     first, second: (vector, direction that it is to have).
     """
     pairs = [first] if second is None else [first, second]
-    given, wanted = (np.array([each / np.linalg.norm(each) for each in side]) for side in zip(*pairs, strict=True))
-    found, _ = Rotation.align_vectors(wanted, given, None if second is None else [np.inf, 1.0])
-    return found
+    vectors, directions = (
+        np.array([vector / np.linalg.norm(vector) for vector in column]) for column in zip(*pairs, strict=True)
+    )
+    rotation, _ = Rotation.align_vectors(directions, vectors, None if second is None else [np.inf, 1.0])
+    return rotation

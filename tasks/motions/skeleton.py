@@ -70,16 +70,17 @@ class Motion:
 
     def _lineage(self, name: str) -> list[int]:
         """Return the indices of a joint, its parent and so on, up to the root."""
-        line = [self.names.index(name)]
-        while line[-1] > 0:
-            line.append(int(self.parents[line[-1]]))
-        return line
+        lineage = [self.names.index(name)]
+        while lineage[-1] > 0:
+            lineage.append(int(self.parents[lineage[-1]]))
+        return lineage
 
 
 def bone(motion: Motion, joint: str) -> np.ndarray:
     """Return the vector (T, 3) [m] from a limb's joint to the end of its bone."""
     side = next(side for side in SIDES if joint.startswith(side))
-    return motion.path(side + ENDS[joint.removeprefix(side)]) - motion.path(joint)
+    vectors: np.ndarray = motion.path(side + ENDS[joint.removeprefix(side)]) - motion.path(joint)
+    return vectors
 
 
 def facing(motion: Motion, frame: int) -> Rotation:
@@ -90,23 +91,28 @@ def facing(motion: Motion, frame: int) -> Rotation:
 
 def is_t_pose(motion: Motion, frame: int) -> bool:
     """Return whether the arms point outwards and the legs down in a frame, each within `T_POSE` [rad]."""
-    straight = facing(motion, frame)
+    to_forwards = facing(motion, frame)
     for side, outwards in zip(SIDES, (1.0, -1.0), strict=True):
         for joint in ENDS:
-            along = straight.apply(bone(motion, side + joint)[frame])
-            wanted = np.array((0.0, 0.0, -1.0) if "Leg" in joint else (0.0, outwards, 0.0))
-            if not along @ wanted > np.cos(T_POSE) * np.linalg.norm(along):
+            direction = to_forwards.apply(bone(motion, side + joint)[frame])
+            expected = np.array((0.0, 0.0, -1.0) if "Leg" in joint else (0.0, outwards, 0.0))
+            if not direction @ expected > np.cos(T_POSE) * np.linalg.norm(direction):
                 return False
     return True
 
 
 def mirrored(motion: Motion) -> Motion:
     """Return the motion mirrored in the plane y = 0, with left and right exchanged."""
-    other = {"Left": "Right", "Right": "Left", "L": "R", "R": "L", "l": "r", "r": "l"}
-    opposite = [re.sub("^(Left|Right|[LRlr])", lambda side: other[side[1]], name) for name in motion.names]
+    opposite_side = {"Left": "Right", "Right": "Left", "L": "R", "R": "L", "l": "r", "r": "l"}
+    opposite_names = [
+        re.sub("^(Left|Right|[LRlr])", lambda side: opposite_side[side[1]], name) for name in motion.names
+    ]
     return replace(
         motion,
-        names=tuple(new if new in motion.names else name for name, new in zip(motion.names, opposite, strict=True)),
+        names=tuple(
+            opposite_name if opposite_name in motion.names else name
+            for name, opposite_name in zip(motion.names, opposite_names, strict=True)
+        ),
         offsets=motion.offsets * (1.0, -1.0, 1.0),
         positions=motion.positions * (1.0, -1.0, 1.0),
         orientations=motion.orientations * (1.0, -1.0, 1.0, -1.0),
@@ -128,8 +134,10 @@ def retarget(motion: Motion, body: Body, dt: float) -> tuple[np.ndarray, np.ndar
             f"dt is {dt!r}, the motion has {len(motion.positions)} frames; needs dt above 0 and two frames"
         )
     times = np.arange(len(motion.positions)) / motion.rate
-    at = np.arange(int(times[-1] / dt + 1e-6) + 1) * dt
-    rotations = [Slerp(times, _link_rotation(motion, link.name))(np.minimum(at, times[-1])) for link in body.links]
+    step_times = np.arange(int(times[-1] / dt + 1e-6) + 1) * dt
+    rotations = [
+        Slerp(times, _link_rotation(motion, link.name))(np.minimum(step_times, times[-1])) for link in body.links
+    ]
     controls = np.stack(
         [(rotations[joint.parent].inv() * rotations[child]).as_rotvec() for child, joint, _ in body.motors], axis=1
     )
@@ -145,12 +153,12 @@ def _link_rotation(motion: Motion, link: str) -> Rotation:
             raise InputError(f"body has a link {link!r}, but captured motions move a human's links alone")
         return motion.rotation(JOINTS.get(link, motion.chest))
     joint = side.capitalize() + LIMBS[segment]
-    turned = motion.rotation(joint)
+    rotations = motion.rotation(joint)
     if LIMBS[segment] not in ENDS:
-        return turned
-    along = turned[0].inv().apply(bone(motion, joint)[0])
-    aligned, _ = Rotation.align_vectors([along], [(0.0, 0.0, -1.0)])
-    return turned * aligned
+        return rotations
+    bone_direction = rotations[0].inv().apply(bone(motion, joint)[0])
+    bone_to_link, _ = Rotation.align_vectors([bone_direction], [(0.0, 0.0, -1.0)])
+    return rotations * bone_to_link
 
 
 def toe_velocity(motion: Motion, side: str) -> np.ndarray:
@@ -162,7 +170,9 @@ def toe_velocity(motion: Motion, side: str) -> np.ndarray:
 
     if len(motion.positions) < SMOOTHING:
         raise InputError(f"motion has {len(motion.positions)} frames, but speeds need {SMOOTHING}")
-    return savgol_filter(motion.path(f"{side}ToeBase"), SMOOTHING, 2, deriv=1, delta=1.0 / motion.rate, axis=0)
+    path = motion.path(f"{side}ToeBase")
+    velocity: np.ndarray = savgol_filter(path, SMOOTHING, 2, deriv=1, delta=1.0 / motion.rate, axis=0)
+    return velocity
 
 
 def kicking_side(motion: Motion) -> str:
@@ -172,7 +182,8 @@ def kicking_side(motion: Motion) -> str:
 
 def toe_speed(motion: Motion) -> np.ndarray:
     """Return the speed (T,) [m/s] of the toes' base of the kicking foot, smoothed as in `toe_velocity`."""
-    return np.linalg.norm(toe_velocity(motion, kicking_side(motion)), axis=-1)
+    speed: np.ndarray = np.linalg.norm(toe_velocity(motion, kicking_side(motion)), axis=-1)
+    return speed
 
 
 def strike(motion: Motion) -> int:

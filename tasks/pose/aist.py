@@ -26,17 +26,17 @@ from tasks.pose.points import POINTS, Keypoints
 # Frames a second, of all films; how many cameras there are.
 RATE, CAMERAS = 60.0, 9
 # Height of our figure's ankles where its feet stand [m]; share of the lowest ankles that are taken for errors [%].
-ANKLE, ASTRAY = 0.067, 5.0
+ANKLE_HEIGHT, GROUND_PERCENTILE = 0.067, 5.0
 # Cameras that AIST++ leaves out itself: one that is not in time with the others, one with smaller images.
 UNUSABLE = {"gBR_sBM_cAll_d04_mBR0_ch01": 4, "gJB_sBM_cAll_d07_mJB3_ch05": 6}
 # Fields of a camera: size and matrix [px], rotation vector from the world, translation [cm], distortion coefficients.
 FIELDS = {"size": (2,), "matrix": (3, 3), "rotation": (3,), "translation": (3,), "distortions": (5,)}
 # Rotation from its world, y up, to ours.
-TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+TO_OUR_AXES = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _COUNT = len(ORDERS[17])
-_KNOWN = [row for row, name in enumerate(POINTS) if name in ORDERS[17]]
-_THEIRS = [ORDERS[17].index(POINTS[row]) for row in _KNOWN]
-_ANKLES = [POINTS.index("left_ankle"), POINTS.index("right_ankle")]
+_OUR_ROWS = [row for row, name in enumerate(POINTS) if name in ORDERS[17]]
+_AIST_ROWS = [ORDERS[17].index(POINTS[row]) for row in _OUR_ROWS]
+_ANKLE_ROWS = [POINTS.index("left_ankle"), POINTS.index("right_ankle")]
 
 
 class Dance(NamedTuple):
@@ -63,10 +63,10 @@ def sequences(folder: Path) -> dict[str, str]:
     return {sequence: setting for sequence, setting in rows if sequence not in faulty}
 
 
-def seen_by(name: str) -> tuple[str, int | None]:
+def sequence_and_camera(name: str) -> tuple[str, int | None]:
     """Return the sequence of a video and its camera, from 0; None for a sequence's own name, with cAll."""
-    found = re.search(rf"_c0([1-{CAMERAS}])_", name)
-    return (name.replace(found[0], "_cAll_", 1), int(found[1]) - 1) if found else (name, None)
+    match = re.search(rf"_c0([1-{CAMERAS}])_", name)
+    return (name.replace(match[0], "_cAll_", 1), int(match[1]) - 1) if match else (name, None)
 
 
 def video(sequence: str, camera: int) -> str:
@@ -90,32 +90,40 @@ def load(folder: Path, sequence: str, camera: int) -> Dance:
         raise InputError(f"camera is {camera}, but must be from 0 to below {CAMERAS}")
     if UNUSABLE.get(sequence) == camera:
         raise InputError(f"sequences has {video(sequence, camera)!r}, a camera that AIST++ leaves out itself")
-    seen = _array(folder / "keypoints2d" / f"{sequence}.pkl", "keypoints2d", (CAMERAS, None, _COUNT, 3))[camera]
-    true = _array(folder / "keypoints3d" / f"{sequence}.pkl", "keypoints3d_optim", (None, _COUNT, 3))
-    if len(seen) != len(true):
-        raise InputError(f"aist: {sequence} has {len(seen)} frames in keypoints2d and {len(true)} in keypoints3d")
+    detections = _array(folder / "keypoints2d" / f"{sequence}.pkl", "keypoints2d", (CAMERAS, None, _COUNT, 3))[camera]
+    true_points = _array(folder / "keypoints3d" / f"{sequence}.pkl", "keypoints3d_optim", (None, _COUNT, 3))
+    if len(detections) != len(true_points):
+        raise InputError(
+            f"aist: {sequence} has {len(detections)} frames in keypoints2d and {len(true_points)} in keypoints3d"
+        )
 
-    points = np.full((len(true), len(POINTS), 3), np.nan)
-    points[:, _KNOWN] = 0.01 * true[:, _THEIRS] @ TURN.T
-    lowest = points[:, _ANKLES, 2].min(axis=1)
-    if np.isnan(lowest).all():
+    points = np.full((len(true_points), len(POINTS), 3), np.nan)
+    points[:, _OUR_ROWS] = 0.01 * true_points[:, _AIST_ROWS] @ TO_OUR_AXES.T
+    lowest_ankles = points[:, _ANKLE_ROWS, 2].min(axis=1)
+    if np.isnan(lowest_ankles).all():
         raise InputError(f"aist: {sequence}.pkl has no frame in keypoints3d_optim with both ankles")
-    ground = np.array([0.0, 0.0, float(np.nanpercentile(lowest, ASTRAY)) - ANKLE])
+    ground = np.array([0.0, 0.0, float(np.nanpercentile(lowest_ankles, GROUND_PERCENTILE)) - ANKLE_HEIGHT])
 
-    held = _camera(folder / "cameras" / f"{settings[sequence]}.json", camera)
-    (width, height), spread, centre = held["size"], held["matrix"][[0, 1], [0, 1]], held["matrix"][:2, 2]
-    turn, focal = Rotation.from_rotvec(held["rotation"]).as_matrix(), float(spread[0])
-    position = -0.01 * TURN @ turn.T @ held["translation"]
+    calibration = _camera(folder / "cameras" / f"{settings[sequence]}.json", camera)
+    (width, height), focal_lengths, centre = (
+        calibration["size"],
+        calibration["matrix"][[0, 1], [0, 1]],
+        calibration["matrix"][:2, 2],
+    )
+    turn, focal = Rotation.from_rotvec(calibration["rotation"]).as_matrix(), float(focal_lengths[0])
+    position = -0.01 * TO_OUR_AXES @ turn.T @ calibration["translation"]
 
-    places, confidence = np.full((len(seen), len(POINTS), 2), np.nan), np.zeros((len(seen), len(POINTS)))
-    straight = undistorted((seen[:, _THEIRS, :2] - centre) / spread, held["distortions"])
-    places[:, _KNOWN] = focal * straight + centre
-    confidence[:, _KNOWN] = np.nan_to_num(seen[:, _THEIRS, 2]).clip(0.0, 1.0)
+    places, confidence = np.full((len(detections), len(POINTS), 2), np.nan), np.zeros((len(detections), len(POINTS)))
+    undistorted_places = undistorted(
+        (detections[:, _AIST_ROWS, :2] - centre) / focal_lengths, calibration["distortions"]
+    )
+    places[:, _OUR_ROWS] = focal * undistorted_places + centre
+    confidence[:, _OUR_ROWS] = np.nan_to_num(detections[:, _AIST_ROWS, 2]).clip(0.0, 1.0)
     confidence[np.isnan(places).any(axis=-1)] = 0.0
     places[confidence == 0.0] = np.nan
     return Dance(
         Keypoints(places, confidence, RATE, (float(width), float(height))),
-        Camera(focal, centre, turn @ TURN.T, position - ground),
+        Camera(focal, centre, turn @ TO_OUR_AXES.T, position - ground),
         points - ground,
     )
 
@@ -126,52 +134,52 @@ def undistorted(places: np.ndarray, distortion: np.ndarray) -> np.ndarray:
     Uses fixed-point iteration, which converges for the small distortion of these lenses.
     """
     k1, k2, p1, p2, k3 = distortion
-    found = places
+    undistorted_places = places
     for _ in range(20):
-        x, y = found[..., 0], found[..., 1]
+        x, y = undistorted_places[..., 0], undistorted_places[..., 1]
         square = x**2 + y**2
         radial = 1.0 + square * (k1 + square * (k2 + square * k3))
-        aside = np.stack(
+        tangential = np.stack(
             [2.0 * p1 * x * y + p2 * (square + 2.0 * x**2), p1 * (square + 2.0 * y**2) + 2.0 * p2 * x * y], axis=-1
         )
-        found = (places - aside) / radial[..., None]
-    return found
+        undistorted_places = (places - tangential) / radial[..., None]
+    return undistorted_places
 
 
-def _camera(path: Path, which: int) -> dict[str, np.ndarray]:
+def _camera(path: Path, camera: int) -> dict[str, np.ndarray]:
     """Return the arrays of `FIELDS` of one camera, from 0, of a setting's file."""
     require_file("aist", path)
     try:
         cameras = json.loads(path.read_bytes())
     except (ValueError, RecursionError):
         raise InputError(f"aist: {path.name} is no JSON file") from None
-    if not isinstance(cameras, list) or len(cameras) != CAMERAS or not isinstance(cameras[which], dict):
+    if not isinstance(cameras, list) or len(cameras) != CAMERAS or not isinstance(cameras[camera], dict):
         raise InputError(f"aist: {path.name} needs a list of {CAMERAS} cameras")
-    held = {}
+    arrays = {}
     for field, shape in FIELDS.items():
         try:
-            held[field] = np.array(cameras[which].get(field), float)
+            arrays[field] = np.array(cameras[camera].get(field), float)
         except (TypeError, ValueError, OverflowError):
-            held[field] = np.array(np.nan)
-        if held[field].shape != shape or not np.isfinite(held[field]).all():
-            needed = " x ".join(map(str, shape))
-            raise InputError(f"aist: {path.name}, camera {which}: {field} needs {needed} finite numbers")
-    if not ((held["size"] > 0.0).all() and (held["matrix"][[0, 1], [0, 1]] > 0.0).all()):
-        raise InputError(f"aist: {path.name}, camera {which}: size and the matrix' focal lengths must be above 0")
-    return held
+            arrays[field] = np.array(np.nan)
+        if arrays[field].shape != shape or not np.isfinite(arrays[field]).all():
+            shape_text = " x ".join(map(str, shape))
+            raise InputError(f"aist: {path.name}, camera {camera}: {field} needs {shape_text} finite numbers")
+    if not ((arrays["size"] > 0.0).all() and (arrays["matrix"][[0, 1], [0, 1]] > 0.0).all()):
+        raise InputError(f"aist: {path.name}, camera {camera}: size and the matrix' focal lengths must be above 0")
+    return arrays
 
 
 def _array(path: Path, name: str, shape: tuple[int | None, ...]) -> np.ndarray:
     require_file("aist", path)
-    held: Any = safe_pickle.load(path)
-    found = held.get(name) if isinstance(held, dict) else None
-    needs = ", ".join("T" if length is None else str(length) for length in shape)
-    if not isinstance(found, np.ndarray) or found.dtype.kind != "f":
-        raise InputError(f"aist: {path.name} needs {name}, floats ({needs})")
-    if found.ndim != len(shape) or not all(
-        wanted in (None, own) for wanted, own in zip(shape, found.shape, strict=True)
+    content: Any = safe_pickle.load(path)
+    array = content.get(name) if isinstance(content, dict) else None
+    shape_text = ", ".join("T" if length is None else str(length) for length in shape)
+    if not isinstance(array, np.ndarray) or array.dtype.kind != "f":
+        raise InputError(f"aist: {path.name} needs {name}, floats ({shape_text})")
+    if array.ndim != len(shape) or not all(
+        expected in (None, actual) for expected, actual in zip(shape, array.shape, strict=True)
     ):
-        raise InputError(f"aist: {path.name} has {name} {found.shape}, but needs ({needs})")
-    if np.isinf(found).any():
+        raise InputError(f"aist: {path.name} has {name} {array.shape}, but needs ({shape_text})")
+    if np.isinf(array).any():
         raise InputError(f"aist: {path.name} has {name} with numbers that are infinite")
-    return found.astype(float)
+    return array.astype(float)

@@ -8,55 +8,59 @@ from threadpoolctl import threadpool_limits
 
 
 class Banded:
-    """Normal equations: blocks (D, D) up to two off the diagonal, an edge of S columns, and their corner (S, S)."""
+    """Normal equations: blocks (D, D) up to two off the diagonal, a border of S columns, and their corner (S, S)."""
 
     def __init__(self, frames: int, size: int, shared: int) -> None:
         self.blocks = np.zeros((3, frames, size, size))  # of rows f + offset, columns f
-        self.edge = np.zeros((frames, size, shared))
+        self.border = np.zeros((frames, size, shared))
         self.corner = np.zeros((shared, shared))
-        self.slope = np.zeros((frames, size)), np.zeros(shared)
+        self.gradient = np.zeros((frames, size)), np.zeros(shared)
 
-    def add(self, weights: np.ndarray, residual: np.ndarray, slopes: tuple[tuple[int, np.ndarray], ...]) -> None:
+    def add(self, weights: np.ndarray, residual: np.ndarray, derivatives: tuple[tuple[int, np.ndarray], ...]) -> None:
         """Add residuals (F, K) of weights (F, K).
 
-        slopes: (offset, derivatives (F, K, D + S)) by frames f + offset and the shared unknowns, offsets rising.
+        derivatives: (offset, values (F, K, D + S)) by frames f + offset and the shared unknowns, offsets rising.
         """
-        split, length = self.edge.shape[1], len(residual)
-        for number, (offset, one) in enumerate(slopes):
-            weighed = (weights[..., None] * one).swapaxes(1, 2)
-            down = (weighed @ residual[..., None])[..., 0]
-            self.slope[0][offset : offset + length] += down[:, :split]
-            self.slope[1][:] += down[:, split:].sum(axis=0)
-            for other, two in slopes[: number + 1]:
-                both = weighed @ two
-                common = both[:, split:, split:].sum(axis=0)
-                self.blocks[offset - other, other : other + length] += both[:, :split, :split]
-                self.edge[offset : offset + length] += both[:, :split, split:]
-                self.corner += common
+        frame_size, length = self.border.shape[1], len(residual)
+        for number, (offset, first) in enumerate(derivatives):
+            weighted = (weights[..., None] * first).swapaxes(1, 2)
+            gradient = (weighted @ residual[..., None])[..., 0]
+            self.gradient[0][offset : offset + length] += gradient[:, :frame_size]
+            self.gradient[1][:] += gradient[:, frame_size:].sum(axis=0)
+            for other, second in derivatives[: number + 1]:
+                product = weighted @ second
+                shared_product = product[:, frame_size:, frame_size:].sum(axis=0)
+                self.blocks[offset - other, other : other + length] += product[:, :frame_size, :frame_size]
+                self.border[offset : offset + length] += product[:, :frame_size, frame_size:]
+                self.corner += shared_product
                 if other < offset:
-                    self.edge[other : other + length] += both[:, split:, :split].swapaxes(1, 2)
-                    self.corner += common.T
+                    self.border[other : other + length] += product[:, frame_size:, :frame_size].swapaxes(1, 2)
+                    self.corner += shared_product.T
 
-    def share(self, weights: np.ndarray, values: np.ndarray) -> None:
+    def add_prior(self, weights: np.ndarray, values: np.ndarray) -> None:
         """Add a prior on the shared unknowns: their values (S,) as residuals, with weights (S, S)."""
         self.corner += weights
-        self.slope[1][:] += weights @ values
+        self.gradient[1][:] += weights @ values
 
-    def solved(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
+    def solve(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the step of frames (F, D) and shared unknowns (S,); damping: share added to the matrix's diagonal."""
         _, frames, size, _ = self.blocks.shape
         band = np.zeros((3 * size, frames * size))
         row, column = np.indices((size, size))
         for offset in range(3):
             below = offset * size + row - column
-            keep = below >= 0
-            columns = np.arange(frames)[:, None] * size + column[keep]
-            band[np.broadcast_to(below[keep], columns.shape), columns] = self.blocks[offset][:, row[keep], column[keep]]
+            in_band = below >= 0
+            columns = np.arange(frames)[:, None] * size + column[in_band]
+            band[np.broadcast_to(below[in_band], columns.shape), columns] = self.blocks[offset][
+                :, row[in_band], column[in_band]
+            ]
         band[0] += damping * band[0] + 1e-6
         corner = self.corner + np.diag(damping * np.diag(self.corner) + 1e-9)
-        edge = self.edge.reshape(frames * size, -1)
+        border = self.border.reshape(frames * size, -1)
         with threadpool_limits(1):  # a band's blocks are so small that several threads take ten times as long
             factor = cholesky_banded(band, lower=True, check_finite=False), True
-            inner = cho_solve_banded(factor, np.column_stack([self.slope[0].ravel(), edge]), check_finite=False)
-        shared = np.linalg.solve(corner - edge.T @ inner[:, 1:], self.slope[1] - edge.T @ inner[:, 0])
-        return -(inner[:, 0] - inner[:, 1:] @ shared).reshape(frames, size), -shared
+            eliminated = cho_solve_banded(
+                factor, np.column_stack([self.gradient[0].ravel(), border]), check_finite=False
+            )
+        shared = np.linalg.solve(corner - border.T @ eliminated[:, 1:], self.gradient[1] - border.T @ eliminated[:, 0])
+        return -(eliminated[:, 0] - eliminated[:, 1:] @ shared).reshape(frames, size), -shared

@@ -15,7 +15,7 @@ from larp_model.errors import InputError
 from larp_model.names import require_file, require_known
 
 # Horizontal field of view of a phone's camera [degrees] and its height [m], where they are not given.
-FIELD_OF_VIEW, HELD = 65.0, 1.4
+FIELD_OF_VIEW, HANDHELD_HEIGHT = 65.0, 1.4
 FIELDS = ("size", "field_of_view", "focal", "centre", "position", "look_at")
 
 
@@ -48,7 +48,7 @@ class Camera:
         return np.concatenate([(places - self.centre) / self.focal, ahead], axis=-1) @ self.turn
 
 
-def looking(position: np.ndarray, at: np.ndarray, focal: float, size: tuple[float, float]) -> Camera:
+def looking_at(position: np.ndarray, at: np.ndarray, focal: float, size: tuple[float, float]) -> Camera:
     """Return an upright camera at a position (3,) that looks at a point (3,) [m]; size: of its images [px]."""
     ahead = np.asarray(at, float) - position
     ahead /= np.linalg.norm(ahead)
@@ -68,10 +68,10 @@ def focal_length(field_of_view: float, width: float) -> float:
     return 0.5 * width / math.tan(math.radians(0.5 * field_of_view))
 
 
-def held(focal: float, size: tuple[float, float]) -> Camera:
-    """Return a level camera at the usual height `HELD`, which looks along x."""
-    position = np.array([0.0, 0.0, HELD])
-    return looking(position, position + np.array([1.0, 0.0, 0.0]), focal, size)
+def handheld(focal: float, size: tuple[float, float]) -> Camera:
+    """Return a level camera at the usual height `HANDHELD_HEIGHT`, which looks along x."""
+    position = np.array([0.0, 0.0, HANDHELD_HEIGHT])
+    return looking_at(position, position + np.array([1.0, 0.0, 0.0]), focal, size)
 
 
 def load(path: str | Path, size: tuple[float, float] | None = None) -> tuple[Camera, bool]:
@@ -122,9 +122,9 @@ def load(path: str | Path, size: tuple[float, float] | None = None) -> tuple[Cam
         position, at = numbers("position", 3), numbers("look_at", 3)
         if not position[2] > 0.0:
             raise InputError(f"camera: position is {position.tolist()}, but must be above the ground, z = 0")
-        found = looking(position, at, focal, size)
+        found = looking_at(position, at, focal, size)
     else:
-        found = held(focal, size)
+        found = handheld(focal, size)
     if "centre" in given:
         found = Camera(focal, numbers("centre", 2), found.turn, found.position)
     return found, "position" in given

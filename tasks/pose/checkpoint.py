@@ -18,26 +18,26 @@ from tasks.pose.figure import Pose
 from tasks.pose.lift import Lifted
 
 
-class Spent(NamedTuple):
+class PlanningEffort(NamedTuple):
     """Effort of planning so far: seconds, seconds of compilation counted separately, and candidates.
 
-    lost: candidates whose rollout was not finite. verified: candidates that were also tried in the ground truth.
+    diverged: candidates whose rollout was not finite. verified: candidates that were also executed in the ground truth.
     """
 
     seconds: float = 0.0
     compile_seconds: float = 0.0
     candidates: int = 0
-    lost: int = 0
+    diverged: int = 0
     verified: int = 0
 
-    def and_by(self, info: PlanInfo) -> Spent:
+    def plus(self, info: PlanInfo) -> PlanningEffort:
         """Return the effort with that of another plan added."""
-        lost = info.candidates - info.finite
-        return Spent(
+        diverged = info.candidates - info.finite
+        return PlanningEffort(
             self.seconds + info.seconds,
             self.compile_seconds + info.compile_seconds,
             self.candidates + info.candidates,
-            self.lost + lost,
+            self.diverged + diverged,
             self.verified + info.verified,
         )
 
@@ -51,28 +51,33 @@ class Progress:
 
     lifted: Lifted | None = None
     checkpoint: Checkpoint | None = None
-    spent: Spent = Spent()
+    effort: PlanningEffort = PlanningEffort()
 
-    def __init__(self, path: Path, made_by: str) -> None:
-        """Load the file; path: npz; made_by: see `fingerprint`. A file of another one, or damaged, is ignored."""
-        self.path, self._made_by = path, made_by
+    def __init__(self, path: Path, inputs: str) -> None:
+        """Load the file; path: npz; inputs: see `fingerprint`. A file of another one, or damaged, is ignored."""
+        self.path, self._inputs = path, inputs
         try:
             with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
-                if str(file["made_by"]) == made_by:
+                if str(file["made_by"]) == inputs:
                     self._take({name: file[name] for name in file.files})
         except Exception:  # numpy and zipfile raise many kinds for a damaged file
-            self.lifted, self.checkpoint, self.spent = None, None, Spent()
+            self.lifted, self.checkpoint, self.effort = None, None, PlanningEffort()
 
-    def save(self, lifted: Lifted, checkpoint: Checkpoint | None = None, spent: Spent = Spent()) -> None:  # noqa: B008
+    def save(
+        self,
+        lifted: Lifted,
+        checkpoint: Checkpoint | None = None,
+        effort: PlanningEffort = PlanningEffort(),  # noqa: B008
+    ) -> None:
         """Write the file."""
         camera = lifted.camera
         content: dict[str, Any] = {
-            "made_by": self._made_by,
+            "made_by": self._inputs,
             **{f"pose_{name}": value for name, value in lifted.pose._asdict().items()},
             **{f"camera_{name}": getattr(camera, name) for name in ("focal", "centre", "turn", "position")},
             "proportions": lifted.proportions,
             "error": lifted.error,
-            "spent": np.array(spent, float),
+            "spent": np.array(effort, float),
         }
         if checkpoint is not None:
             content |= {f"plan_{name}": value for name, value in checkpoint.plan._asdict().items()}
@@ -85,20 +90,22 @@ class Progress:
         """Delete the file, as the reconstruction is complete."""
         self.path.unlink(missing_ok=True)
 
-    def _take(self, found: dict[str, np.ndarray]) -> None:
-        def of(kind: str, fields: tuple[str, ...]) -> Iterator[np.ndarray]:
-            return (found[f"{kind}_{name}"] for name in fields)
+    def _take(self, arrays: dict[str, np.ndarray]) -> None:
+        def values_of(kind: str, fields: tuple[str, ...]) -> Iterator[np.ndarray]:
+            return (arrays[f"{kind}_{name}"] for name in fields)
 
-        focal, *rest = of("camera", ("focal", "centre", "turn", "position"))
-        camera = Camera(float(focal), *rest)
-        self.lifted = Lifted(Pose(*of("pose", Pose._fields)), found["proportions"], camera, float(found["error"]))
-        seconds, compiling, *counts = found["spent"].tolist()
-        self.spent = Spent(seconds, compiling, *map(int, counts))
-        if "states" in found:
-            elites, spread, start, key = of("plan", Plan._fields)
+        focal, *others = values_of("camera", ("focal", "centre", "turn", "position"))
+        camera = Camera(float(focal), *others)
+        self.lifted = Lifted(
+            Pose(*values_of("pose", Pose._fields)), arrays["proportions"], camera, float(arrays["error"])
+        )
+        seconds, compiling, *counts = arrays["spent"].tolist()
+        self.effort = PlanningEffort(seconds, compiling, *map(int, counts))
+        if "states" in arrays:
+            elites, spread, start, key = values_of("plan", Plan._fields)
             plan = Plan(elites, spread, np.float32(start), key)
             self.checkpoint = Checkpoint(
-                found["states"], found["controls"], plan, int(found["step"]), int(found["phase"])
+                arrays["states"], arrays["controls"], plan, int(arrays["step"]), int(arrays["phase"])
             )
 
 

@@ -31,9 +31,9 @@ from viewer import write_overlay
 # Heights of people [m].
 HEIGHTS = 1.3, 2.2
 # A median error [share of the image] beyond which the figure does not fit the person.
-ASTRAY = 0.03
+MAX_MEDIAN_ERROR = 0.03
 # Feet slip less than this in films of a camera that stands still [m/s].
-SLIPPING = 0.12
+MAX_SLIP = 0.12
 
 
 def camera_of(path: Path | None, film: Keypoints) -> tuple[Camera, bool]:
@@ -42,27 +42,30 @@ def camera_of(path: Path | None, film: Keypoints) -> tuple[Camera, bool]:
         return cameras.load(path, film.size)
     if film.size is None:
         raise InputError("size is not known, but the images' width and height are needed, or a camera file with them")
-    return cameras.held(cameras.focal_length(cameras.FIELD_OF_VIEW, film.size[0]), film.size), False
+    return cameras.handheld(cameras.focal_length(cameras.FIELD_OF_VIEW, film.size[0]), film.size), False
 
 
 def lifted_of(
-    film: Keypoints, lens: Camera, known: bool, height: float | None, progress: Progress, tell: Teller
+    film: Keypoints, lens: Camera, position_known: bool, height: float | None, progress: Progress, teller: Teller
 ) -> Lifted:
-    """Return the kinematic start, from the saved progress if it is there. known: whether the camera's position is."""
+    """Return the kinematic start, from the saved progress if it is there.
+
+    position_known: whether the camera's position is known.
+    """
     if progress.lifted is not None:
-        done = 0 if progress.checkpoint is None else len(progress.checkpoint.controls)
-        tell(f"going on from {progress.path}, {done} steps done")
+        steps_done = 0 if progress.checkpoint is None else len(progress.checkpoint.controls)
+        teller(f"going on from {progress.path}, {steps_done} steps done")
         return progress.lifted
-    with tell.part(f"laying a figure over {len(film)} frames"):
-        lifted = lift.lift(film, lens, known, height)
+    with teller.part(f"laying a figure over {len(film)} frames"):
+        lifted = lift.lift(film, lens, position_known, height)
     progress.save(lifted)
     return lifted
 
 
 def summary_of(film: Keypoints, result: Reconstruction, slip: float) -> dict[str, Any]:
     """Return the figures of a reconstruction, entries of `summary.json`. slip: see `metrics.slip` [m/s]."""
-    lifted, spent = result.lifted, result.spent
-    apart = np.linalg.norm(lifted.camera.project(result.found) - film.places, axis=-1)[film.seen]
+    lifted, effort = result.lifted, result.effort
+    distances = np.linalg.norm(lifted.camera.project(result.executed) - film.places, axis=-1)[film.detected]
     return {
         "frames": len(film),
         "rate": film.rate,
@@ -71,14 +74,14 @@ def summary_of(film: Keypoints, result: Reconstruction, slip: float) -> dict[str
         "focal_px": float(lifted.camera.focal),
         "kinematic_error_px": lifted.error,
         "slip_m_s": slip,
-        "camera_seems_to_move": slip > SLIPPING,
-        "error_px": float(np.median(apart)),
+        "camera_seems_to_move": slip > MAX_SLIP,
+        "error_px": float(np.median(distances)),
         "fell": result.fell,
-        "plan_seconds": spent.seconds,
-        "compile_seconds": spent.compile_seconds,
-        "candidates": spent.candidates,
-        "candidates_lost": spent.lost,
-        "truth_rollouts": spent.verified,
+        "plan_seconds": effort.seconds,
+        "compile_seconds": effort.compile_seconds,
+        "candidates": effort.candidates,
+        "candidates_lost": effort.diverged,
+        "truth_rollouts": effort.verified,
     }
 
 
@@ -99,11 +102,11 @@ def table_of(summary: dict[str, Any]) -> Table:
 def write(folder: Path, film: Keypoints, result: Reconstruction, summary: dict[str, Any]) -> None:
     """Write the motion, its pictures and, last, `summary.json`; of a human who fell, the kinematic start."""
     buffer = io.BytesIO()
-    motion = angles_of(result.wanted.states if result.fell else result.states, result.body, DT)
+    motion = angles_of(result.filmed.states if result.fell else result.states, result.body, DT)
     np.savez_compressed(buffer, **motion)
     write_whole(folder / "pose.npz", buffer.getvalue())
     write_whole(folder / "pose.bvh", bvh.dumps(angles.motion(**motion)).encode())
-    pose_picture(film, result.lifted.camera, result.found, result.start, folder / "pose.png")
+    pose_picture(film, result.lifted.camera, result.executed, result.start, folder / "pose.png")
     write_overlay(overlay_of(film, result), folder / "pose.html")
     write_whole(folder / "summary.json", (text.dumps(summary, indent=2) + "\n").encode())
 
@@ -146,31 +149,33 @@ def main(
     require_writable(out, "out")
     loaded = formats.load(keypoints, rate, size, person)
     film = cut(loaded.keypoints)
-    lens, known = camera_of(camera, film)
+    lens, position_known = camera_of(camera, film)
     prepare_jax()
-    tell = Teller(quiet, json)
+    teller = Teller(quiet, json)
     if loaded.crossed:
-        tell(f"another person is before or behind this one in {loaded.crossed} frames: look at them in pose.png")
-    of_camera = lens.focal, lens.centre, lens.turn, lens.position, known
-    settings = height or 0.0, dynamics, repr(physical.PRESETS[preset]), seed
-    inputs = fingerprint(film.places, film.confidence, film.rate, *of_camera, *settings)
+        teller(f"another person is before or behind this one in {loaded.crossed} frames: look at them in pose.png")
+    camera_inputs = lens.focal, lens.centre, lens.turn, lens.position, position_known
+    other_inputs = height or 0.0, dynamics, repr(physical.PRESETS[preset]), seed
+    inputs = fingerprint(film.places, film.confidence, film.rate, *camera_inputs, *other_inputs)
     progress = Progress(out / "unfinished.npz", inputs)
-    lifted = lifted_of(film, lens, known, height, progress, tell)
-    if lifted.error > ASTRAY * 2.0 * np.max(lens.centre):
-        tell(f"half of the points are more than {lifted.error:.0f} px off: does the camera move, or is it another one?")
+    lifted = lifted_of(film, lens, position_known, height, progress, teller)
+    if lifted.error > MAX_MEDIAN_ERROR * 2.0 * np.max(lens.centre):
+        teller(
+            f"half of the points are more than {lifted.error:.0f} px off: does the camera move, or is it another one?"
+        )
     slip = metrics.slip(figures.figure().all_points(lifted.pose, lifted.proportions), film.rate)
-    if slip > SLIPPING:
-        tell(f"the feet slip, by {slip:.2f} m/s where they ought to stand: does the camera move, or the ground?")
-    with tell.bar("planning and executing") as at:
-        result = reconstruct(film, lifted, dynamics, physical.PRESETS[preset], seed, progress, at)
+    if slip > MAX_SLIP:
+        teller(f"the feet slip, by {slip:.2f} m/s where they ought to stand: does the camera move, or the ground?")
+    with teller.bar("planning and executing") as on_step:
+        result = reconstruct(film, lifted, dynamics, physical.PRESETS[preset], seed, progress, on_step)
     if result.fell:
-        tell("the human fell: pose.npz and pose.bvh hold the kinematic start instead, which no physics has seen")
+        teller("the human fell: pose.npz and pose.bvh hold the kinematic start instead, which no physics has seen")
     summary = summary_of(film, result, slip) | {"people": loaded.people, "crossed": loaded.crossed}
     summary |= {"dynamics": dynamics, "preset": preset, "seed": seed}
     write(out, film, result, summary)
     progress.delete()
-    tell.result(table_of(summary), summary)
-    tell(f"{out}/: summary.json, pose.npz, pose.bvh, pose.png, pose.html")
+    teller.result(table_of(summary), summary)
+    teller(f"{out}/: summary.json, pose.npz, pose.bvh, pose.png, pose.html")
 
 
 def cli() -> None:

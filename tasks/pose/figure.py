@@ -23,8 +23,8 @@ PROPORTIONS = (
 )  # fmt: skip
 # Points that are joints, and the link that each carries.
 JOINTS = {"shoulder": "upper_arm", "elbow": "lower_arm", "hip": "thigh", "knee": "shin", "ankle": "foot"}
-# Places of the other points on their links, given as joints' anchors are: along the axis in half-lengths, across it in
-# radii. A wrist is at the end of the forearm (0.146 of the height, D. Winter).
+# Places of the other points on their links, in the units of joints' anchors: along the axis in half-lengths, across it
+# in radii. A wrist is at the end of the forearm (0.146 of the height, D. Winter).
 ON_LIMBS: dict[str, tuple[str, Vector]] = {
     "wrist": ("lower_arm", (0.0, 0.0, -0.7)),
     "heel": ("foot", (-1.3, 0.0, -0.6)),
@@ -33,9 +33,9 @@ ON_LIMBS: dict[str, tuple[str, Vector]] = {
 ON_HEAD: dict[str, Vector] = {"nose": (1.0, 0.0, 0.0), "left_ear": (0.0, 0.8, 0.2), "right_ear": (0.0, -0.8, 0.2)}
 SHARED = 1 + len(PROPORTIONS) + 1
 # Height of the usual human [m].
-USUAL = 1.75
+USUAL_HEIGHT = 1.75
 # Height of heel and toe where the foot stands [m].
-SOLE = 0.017
+SOLE_HEIGHT = 0.017
 
 
 class Pose(NamedTuple):
@@ -55,29 +55,29 @@ class Figure:
     """
 
     def __init__(self) -> None:
-        self.body = human(height=USUAL)
+        self.body = human(height=USUAL_HEIGHT)
         self.sizes = self.body.sizes
         names = [link.name for link in self.body.links]
-        self.anchors = {name: (names.index("head"), at) for name, at in ON_HEAD.items()}
+        self.anchors = {name: (names.index("head"), anchor) for name, anchor in ON_HEAD.items()}
         for side in SIDES:
             for limb, segment in JOINTS.items():
                 link = names.index(f"{side}_{segment}")
                 self.anchors[f"{side}_{limb}"] = link, self.body.joints[link - 1].child_anchor
-            for limb, (segment, at) in ON_LIMBS.items():
-                self.anchors[f"{side}_{limb}"] = names.index(f"{side}_{segment}"), at
+            for limb, (segment, anchor) in ON_LIMBS.items():
+                self.anchors[f"{side}_{limb}"] = names.index(f"{side}_{segment}"), anchor
         self.joints, self.torso = len(self.body.joints), names.index("torso")
         self.lower, self.upper = self.body.limits
-        share = np.zeros((len(PROPORTIONS), len(names), 2))
-        for row, (segment, what) in enumerate(PROPORTIONS):
-            share[row, [segment_of(name) == segment for name in names], what] = 1.0
-        self._share = share
+        scale_map = np.zeros((len(PROPORTIONS), len(names), 2))
+        for row, (segment, column) in enumerate(PROPORTIONS):
+            scale_map[row, [segment_of(name) == segment for name in names], column] = 1.0
+        self._scale_map = scale_map
 
     def scaled(self, proportions: Array) -> Array:
         """Return lengths and radii (n, 2) [m] of the links."""
-        grown = proportions[0] + jnp.einsum("p,pnk->nk", proportions[1:-1], jnp.asarray(self._share))
-        return jnp.asarray(self.sizes[:, :2]) * jnp.exp(grown)
+        log_scale = proportions[0] + jnp.einsum("p,pnk->nk", proportions[1:-1], jnp.asarray(self._scale_map))
+        return jnp.asarray(self.sizes[:, :2]) * jnp.exp(log_scale)
 
-    def of(self, proportions: np.ndarray) -> Body:
+    def body_of(self, proportions: np.ndarray) -> Body:
         """Return the human of these proportions; its mass scales with the cube of the overall size."""
         sizes = np.array(self.sizes)
         sizes[:, :2] = np.asarray(self.scaled(jnp.asarray(proportions)), float)
@@ -88,35 +88,37 @@ class Figure:
     def height(self, proportions: Array) -> Array:
         """Return the standing height [m], in proportion to the nose's height above the heels."""
 
-        def reach(proportions: Array) -> Array:
+        def nose_height(proportions: Array) -> Array:
             points = self.points(jnp.zeros(3), jnp.eye(3), jnp.zeros((self.joints, 3)), proportions)
             return points[POINTS.index("nose"), 2] - points[FEET[0], 2]
 
-        return USUAL * reach(proportions) / reach(jnp.zeros(SHARED))
+        return USUAL_HEIGHT * nose_height(proportions) / nose_height(jnp.zeros(SHARED))
 
     def points(self, place: Array, turn: Array, angles: Array, proportions: Array) -> Array:
         """Return points (P, 3) [m] of one pose: pelvis (3,) [m], its rotation (3, 3), joint angles (J, 3) [rad]."""
         sizes = self.scaled(proportions)
-        turned = matrix(from_rotation_vector(angles))
-        places, turns = [place], [turn]
+        joint_rotations = matrix(from_rotation_vector(angles))
+        positions, rotations = [place], [turn]
 
-        def reach(link: int, at: Vector) -> Array:
+        def anchor_offset(link: int, anchor: Vector) -> Array:
             axis = np.asarray(self.body.links[link].axis)
-            along = np.asarray(at) @ axis * axis
-            return turns[link] @ (0.5 * sizes[link, 0] * along + sizes[link, 1] * (np.asarray(at) - along))
+            axial = np.asarray(anchor) @ axis * axis
+            return rotations[link] @ (0.5 * sizes[link, 0] * axial + sizes[link, 1] * (np.asarray(anchor) - axial))
 
         for child, joint in enumerate(self.body.joints, start=1):
-            turns.append(turns[joint.parent] @ turned[child - 1])
-            tied = places[joint.parent] + reach(joint.parent, joint.parent_anchor)
-            places.append(tied - reach(child, joint.child_anchor))
-        found = {name: places[link] + reach(link, at) for name, (link, at) in self.anchors.items()}
-        ahead = proportions[-1] * sizes[self.torso, 0] * turns[self.torso][:, 0]
-        return jnp.stack([found[name] + ahead if "shoulder" in name else found[name] for name in POINTS])
+            rotations.append(rotations[joint.parent] @ joint_rotations[child - 1])
+            joint_position = positions[joint.parent] + anchor_offset(joint.parent, joint.parent_anchor)
+            positions.append(joint_position - anchor_offset(child, joint.child_anchor))
+        anchored = {
+            name: positions[link] + anchor_offset(link, anchor) for name, (link, anchor) in self.anchors.items()
+        }
+        shoulder_shift = proportions[-1] * sizes[self.torso, 0] * rotations[self.torso][:, 0]
+        return jnp.stack([anchored[name] + shoulder_shift if "shoulder" in name else anchored[name] for name in POINTS])
 
     def all_points(self, pose: Pose, proportions: np.ndarray) -> np.ndarray:
         """Return the points (T, P, 3) [m] of all frames."""
-        common = single(proportions)
-        return by_rows(lambda *given: _all_points(self, *given, common), *pose)
+        single_proportions = single(proportions)
+        return by_rows(lambda *pose_rows: _all_points(self, *pose_rows, single_proportions), *pose)
 
 
 @cache
@@ -125,4 +127,4 @@ def figure() -> Figure:
     return Figure()
 
 
-_all_points = jax.jit(lambda figure, *given: jax.vmap(figure.points, (0, 0, 0, None))(*given), static_argnums=0)
+_all_points = jax.jit(lambda figure, *pose_rows: jax.vmap(figure.points, (0, 0, 0, None))(*pose_rows), static_argnums=0)

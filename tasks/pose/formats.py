@@ -50,16 +50,16 @@ ORDERS = {
     136: _HALPE,
 }
 
-_UNDERSTOOD = "understood are OpenPose's folder of JSON files, JSON of AlphaPose, MMPose or MediaPipe, and npz"
-_FEWEST_POINTS = 6
-_MOST_FRAMES = 100_000
-_LARGEST = 1e6
+_SUPPORTED = "understood are OpenPose's folder of JSON files, JSON of AlphaPose, MMPose or MediaPipe, and npz"
+_MIN_POINTS = 6
+_MAX_FRAMES = 100_000
+_MAX_VALUE = 1e6
 # A person may be lost for this time [s]. Then the points may be this far from where they were, on average: at once
 # [the person's size], and more with the time [sizes a second].
-_LOST, _LEAP, _PACE = 0.5, 0.25, 3.0
+_LOST_SECONDS, _REACH_AT_ONCE, _REACH_PER_SECOND = 0.5, 0.25, 3.0
 
 
-class Loaded(NamedTuple):
+class LoadedKeypoints(NamedTuple):
     """Keypoints of one person, with the number of people in the file.
 
     crossed: number of frames in which another person's bounding box and this one's share more than half of the smaller
@@ -91,7 +91,7 @@ _Track = dict[int, _Detection]  # one person's, by frame, in the order of the fr
 
 def load(
     path: str | Path, rate: float | None = None, size: tuple[float, float] | None = None, person: int | None = None
-) -> Loaded:
+) -> LoadedKeypoints:
     """Read one person's points; an InputError of one line names what is missing, damaged or not understood.
 
     path: a file, or a folder with one for each frame. rate: frames per second. size: width and height of the images
@@ -106,7 +106,7 @@ def load(
     name = path.absolute().name
     if not path.is_dir():
         require_file("path", path)
-    size = None if size is None else _size(size)
+    size = None if size is None else _checked_size(size)
     try:
         film = _read(path, size)
         frames = _in_order(film.frames)
@@ -122,21 +122,23 @@ def load(
         raise InputError(f"person is {person}, but must be from 0 to below {len(tracks)}, the people in {name}")
     track = max(tracks, key=_prominence) if person is None else tracks[person]
     points = np.full((len(frames), len(POINTS), 3), (np.nan, np.nan, 0.0))
-    points[list(track)] = [one.points for one in track.values()]
-    seen = np.flatnonzero(points[..., 2].any(axis=0))
-    if len(seen) < _FEWEST_POINTS:
-        only = ", ".join(POINTS[point] for point in seen)
-        raise InputError(f"{name} has only {only} of this person, but needs {_FEWEST_POINTS} points or more")
+    points[list(track)] = [detection.points for detection in track.values()]
+    detected = np.flatnonzero(points[..., 2].any(axis=0))
+    if len(detected) < _MIN_POINTS:
+        detected_names = ", ".join(POINTS[point] for point in detected)
+        raise InputError(f"{name} has only {detected_names} of this person, but needs {_MIN_POINTS} points or more")
     keypoints = Keypoints(points[..., :2], points[..., 2], float(rate), size or film.size)
-    return Loaded(keypoints, len(tracks), sum(_crossed(one, frames[frame]) for frame, one in track.items()))
+    return LoadedKeypoints(
+        keypoints, len(tracks), sum(_is_crossed(detection, frames[frame]) for frame, detection in track.items())
+    )
 
 
 def _read(path: Path, size: tuple[float, float] | None) -> _Film:
     if path.is_dir():
-        return _Film(_folder(path))
+        return _Film(_folder_frames(path))
     with path.open("rb") as file:
         zipped = file.read(2) == b"PK"
-    return _npz(path) if zipped else _Film(_frames(_parsed(path), size))
+    return _npz(path) if zipped else _Film(_json_frames(_json_content(path), size))
 
 
 def _in_order(frames: Mapping[int, list[_Detection]]) -> list[list[_Detection]]:
@@ -144,21 +146,23 @@ def _in_order(frames: Mapping[int, list[_Detection]]) -> list[list[_Detection]]:
     if not frames:
         raise InputError("has no frames")
     first, last = min(frames), max(frames)
-    if last - first >= _MOST_FRAMES:
-        raise InputError(f"has frames from {first} to {last}, but may have {_MOST_FRAMES} at most")
+    if last - first >= _MAX_FRAMES:
+        raise InputError(f"has frames from {first} to {last}, but may have {_MAX_FRAMES} at most")
     numbers = range(first, last + 1)
-    found = [[one for one in frames.get(number, []) if one.points[:, 2].any()] for number in numbers]
-    if not any(found):
+    ordered = [
+        [detection for detection in frames.get(number, []) if detection.points[:, 2].any()] for number in numbers
+    ]
+    if not any(ordered):
         raise InputError("has no person in any frame")
-    return found
+    return ordered
 
 
-def _folder(path: Path) -> dict[int, list[_Detection]]:
+def _folder_frames(path: Path) -> dict[int, list[_Detection]]:
     frames = {}
     names = sorted(file.name for file in path.glob("*.json") if not file.name.startswith("."))
-    for number, name in _numbered(names).items():
+    for number, name in _by_number(names).items():
         try:
-            match _parsed(path / str(name)):
+            match _json_content(path / str(name)):
                 case {"people": people} | [*people]:
                     frames[number] = _people(people)
                 case _:
@@ -168,61 +172,61 @@ def _folder(path: Path) -> dict[int, list[_Detection]]:
     return frames
 
 
-def _numbered(labels: Iterable[object]) -> dict[int, object]:
+def _by_number(labels: Iterable[object]) -> dict[int, object]:
     """Return the frames' labels (names of images or files) by the last number in each, extensions ignored."""
     numbered: dict[int, object] = {}
     for label in labels:
         numbers = re.findall(r"\d+", Path(str(label)).stem)
         if not numbers:
-            raise InputError(f"has {_short(label)} as a frame, but needs the frame's number in the name")
+            raise InputError(f"has {_shortened(label)} as a frame, but needs the frame's number in the name")
         if int(numbers[-1]) in numbered:
             raise InputError(f"has two frames with number {int(numbers[-1])}, but needs the frames of one film")
         numbered[int(numbers[-1])] = label
     return numbered
 
 
-def _parsed(path: Path) -> object:
+def _json_content(path: Path) -> object:
     try:
         return json.loads(path.read_bytes())
     except (ValueError, RecursionError) as error:
-        raise InputError(f"is not whole as JSON ({error}); {_UNDERSTOOD}") from None
+        raise InputError(f"is not whole as JSON ({error}); {_SUPPORTED}") from None
 
 
-def _frames(content: object, size: tuple[float, float] | None) -> dict[int, list[_Detection]]:
+def _json_frames(content: object, size: tuple[float, float] | None) -> dict[int, list[_Detection]]:
     """Return the frames of a JSON file that contains all of them."""
     match content:
         case {"instance_info": [*entries], **more}:
-            return _of_mmpose(entries, _called(more.get("meta_info")))
+            return _mmpose_frames(entries, _own_point_names(more.get("meta_info")))
         case [*entries]:
             match next((entry for entry in entries if entry), []):
                 case {"image_id": _}:
-                    return _of_alphapose(entries)
+                    return _alphapose_frames(entries)
                 case {"frame_id": _}:
-                    return _of_mmpose(entries)
+                    return _mmpose_frames(entries)
                 case {"landmarks": _} | [{"x": _}, *_]:
-                    return {number: _of_mediapipe(entry, size) for number, entry in enumerate(entries)}
+                    return {number: _mediapipe_people(entry, size) for number, entry in enumerate(entries)}
                 case [] | [{"keypoints": _}, *_]:
                     return {number: _people(entry) for number, entry in enumerate(entries)}
-    raise InputError(f"is JSON of another kind; {_UNDERSTOOD}")
+    raise InputError(f"is JSON of another kind; {_SUPPORTED}")
 
 
-def _of_alphapose(entries: list) -> dict[int, list[_Detection]]:
+def _alphapose_frames(entries: list) -> dict[int, list[_Detection]]:
     if not all(isinstance(entry, dict) and "image_id" in entry for entry in entries):
         raise InputError("has an entry without image_id")
     people: dict[object, list] = {}
     for entry in entries:
         people.setdefault(str(entry["image_id"]), []).append(entry)
-    return {number: _people(people[image]) for number, image in _numbered(people).items()}
+    return {number: _people(people[image]) for number, image in _by_number(people).items()}
 
 
-def _of_mmpose(entries: list, names: tuple[str, ...] | None = None) -> dict[int, list[_Detection]]:
+def _mmpose_frames(entries: list, names: tuple[str, ...] | None = None) -> dict[int, list[_Detection]]:
     if not all(isinstance(entry, dict) and {"frame_id", "instances"} <= entry.keys() for entry in entries):
         raise InputError("has an entry without frame_id and instances")
-    numbers = _numbered(entry["frame_id"] for entry in entries)
+    numbers = _by_number(entry["frame_id"] for entry in entries)
     return {number: _people(entry["instances"], names) for number, entry in zip(numbers, entries, strict=True)}
 
 
-def _called(meta: object) -> tuple[str, ...] | None:
+def _own_point_names(meta: object) -> tuple[str, ...] | None:
     """Return MMPose's own names of the points, in their order; None where the file has none."""
     match meta:
         case {"keypoint_id2name": {**table}}:
@@ -235,16 +239,16 @@ def _called(meta: object) -> tuple[str, ...] | None:
 
 def _people(entries: object, names: tuple[str, ...] | None = None) -> list[_Detection]:
     """Return the people of a frame of OpenPose, AlphaPose or MMPose."""
-    found = []
-    for entry in _list(entries):
+    people = []
+    for entry in _checked_list(entries):
         match entry:
             case {"keypoints": places, "keypoint_scores": scores}:
-                places, scores = _numbers("keypoints", places), _numbers("keypoint_scores", scores)
+                places, scores = _checked_numbers("keypoints", places), _checked_numbers("keypoint_scores", scores)
                 if scores.ndim != 1 or places.shape != (len(scores), 2):
                     raise InputError(f"has keypoints {places.shape}, but needs (P, 2), and keypoint_scores (P,)")
                 rows = np.column_stack([places, scores])
             case {"pose_keypoints_2d": numbers} | {"keypoints": numbers}:
-                rows = _numbers("keypoints", numbers)
+                rows = _checked_numbers("keypoints", numbers)
                 if rows.size % 3:
                     raise InputError(f"has keypoints of {rows.size} numbers, but needs x, y and confidence of each")
                 rows = rows.reshape(-1, 3)
@@ -252,12 +256,12 @@ def _people(entries: object, names: tuple[str, ...] | None = None) -> list[_Dete
                 raise InputError("has a person without keypoints")
         rows[(rows[:, :2] == 0.0).all(axis=1)] = 0.0
         identity = next((entry[key] for key in ("person_id", "idx", "track_id") if key in entry), None)
-        found.append(_Detection(_ours(rows, names), _identity(identity)))
-    return found
+        people.append(_Detection(_in_our_order(rows, names), _identity(identity)))
+    return people
 
 
-def _of_mediapipe(frame: object, size: tuple[float, float] | None) -> list[_Detection]:
-    landmarks = _list(frame.get("landmarks", frame) if isinstance(frame, dict) else frame)
+def _mediapipe_people(frame: object, size: tuple[float, float] | None) -> list[_Detection]:
+    landmarks = _checked_list(frame.get("landmarks", frame) if isinstance(frame, dict) else frame)
     if size is None:
         raise InputError("has places as parts of the image: give size, its width and height in pixels")
     try:
@@ -265,81 +269,81 @@ def _of_mediapipe(frame: object, size: tuple[float, float] | None) -> list[_Dete
     except (KeyError, TypeError):
         raise InputError("has a landmark without x, y and visibility") from None
     # One person, who may be lost for long.
-    return [_Detection(_ours(_numbers("landmarks", rows) * (*size, 1.0)), 0.0)] if rows else []
+    return [_Detection(_in_our_order(_checked_numbers("landmarks", rows) * (*size, 1.0)), 0.0)] if rows else []
 
 
 def _npz(path: Path) -> _Film:
     try:
         # numpy does not close the file itself if it is damaged.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            held = dict(arrays)
+            content = dict(arrays)
     except Exception:  # Each part of an archive is damaged in its own way.
         raise InputError("is no whole npz file of numbers and names") from None
-    kind, columns = ("points", 3) if "points" in held else ("places", 2)
-    if not {"names", kind} <= held.keys():
+    kind, columns = ("points", 3) if "points" in content else ("places", 2)
+    if not {"names", kind} <= content.keys():
         raise InputError("is npz without names, and places or points")
-    names = tuple(str(name) for name in held["names"].ravel())
+    names = tuple(str(name) for name in content["names"].ravel())
     for name in names:
         require_known("has a name that", name, POINTS)
     if len(set(names)) < len(names):
         raise InputError("has a name twice")
-    rows = _numbers(kind, held[kind])
+    rows = _checked_numbers(kind, content[kind])
     if rows.ndim != 3 or rows.shape[1:] != (len(names), columns):
         raise InputError(f"has {kind} {rows.shape}, but needs (T, {len(names)}, {columns})")
     if kind == "places":
-        confidence = _numbers("confidence", held.get("confidence", np.ones(rows.shape[:2])))
+        confidence = _checked_numbers("confidence", content.get("confidence", np.ones(rows.shape[:2])))
         if confidence.shape != rows.shape[:2]:
             raise InputError(f"has confidence {confidence.shape}, but needs {rows.shape[:2]}")
         rows = np.dstack([rows, confidence])
     rows[np.isnan(rows[..., :2]).any(axis=-1)] = 0.0
-    rate = _numbers("rate", held.get("rate", np.nan))
+    rate = _checked_numbers("rate", content.get("rate", np.nan))
     if rate.shape:
         raise InputError(f"has a rate {rate.shape}, but needs one number")
     return _Film(
-        {number: [_Detection(_ours(frame, names), 0.0)] for number, frame in enumerate(rows)},
-        float(rate) if "rate" in held else None,
-        _size(held["size"]) if "size" in held else None,
+        {number: [_Detection(_in_our_order(frame, names), 0.0)] for number, frame in enumerate(rows)},
+        float(rate) if "rate" in content else None,
+        _checked_size(content["size"]) if "size" in content else None,
     )
 
 
-def _size(value: object) -> tuple[float, float]:
-    numbers = _numbers("size", value)
-    if numbers.shape != (2,) or not ((numbers > 0.0) & (numbers < _LARGEST)).all():
-        raise InputError(f"size is {_short(value)}, but must be a width and a height above 0, in pixels")
+def _checked_size(value: object) -> tuple[float, float]:
+    numbers = _checked_numbers("size", value)
+    if numbers.shape != (2,) or not ((numbers > 0.0) & (numbers < _MAX_VALUE)).all():
+        raise InputError(f"size is {_shortened(value)}, but must be a width and a height above 0, in pixels")
     return float(numbers[0]), float(numbers[1])
 
 
-def _short(value: object) -> str:
+def _shortened(value: object) -> str:
     return shorten(str(value), 60, placeholder=" ...") or "nothing"
 
 
-def _list(value: object) -> list:
+def _checked_list(value: object) -> list:
     if not isinstance(value, list | None):
-        raise InputError(f"has {_short(value)} where it needs a list")
+        raise InputError(f"has {_shortened(value)} where it needs a list")
     return value or []
 
 
-def _numbers(what: str, value: object) -> np.ndarray:
+def _checked_numbers(what: str, value: object) -> np.ndarray:
     try:
         return np.array(value, float)
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"has {what} with something that is not a number") from None
 
 
-def _ours(rows: np.ndarray, names: tuple[str, ...] | None = None) -> np.ndarray:
+def _in_our_order(rows: np.ndarray, names: tuple[str, ...] | None = None) -> np.ndarray:
     """Return places [px] and confidence of `POINTS` (P, 3) from a detector's rows; NaN and 0 where not detected."""
     if len(rows) not in (ORDERS if names is None else {len(names)}):
-        known = ", ".join(map(str, ORDERS)) if names is None else f"{len(names)}, as many as it names"
-        raise InputError(f"has a person of {len(rows)} points, but needs {known}")
-    if not (abs(rows) < _LARGEST).all():
-        raise InputError(f"has places or confidences that are not finite, or not below {_LARGEST:g}")
-    found = np.zeros((len(POINTS), 3))
+        accepted = ", ".join(map(str, ORDERS)) if names is None else f"{len(names)}, as many as it names"
+        raise InputError(f"has a person of {len(rows)} points, but needs {accepted}")
+    if not (abs(rows) < _MAX_VALUE).all():
+        raise InputError(f"has places or confidences that are not finite, or not below {_MAX_VALUE:g}")
+    detected = np.zeros((len(POINTS), 3))
     for row, name in enumerate(ORDERS[len(rows)] if names is None else names):
         if name in POINTS:
-            found[POINTS.index(name)] = rows[row]
-    found[:, 2] = found[:, 2].clip(0.0, 1.0)
-    found[found[:, 2] == 0.0, :2] = np.nan
-    return found
+            detected[POINTS.index(name)] = rows[row]
+    detected[:, 2] = detected[:, 2].clip(0.0, 1.0)
+    detected[detected[:, 2] == 0.0, :2] = np.nan
+    return detected
 
 
 def _identity(value: object) -> float | None:
@@ -351,67 +355,75 @@ def _identity(value: object) -> float | None:
 
 def _tracks(frames: list[list[_Detection]], rate: float) -> list[_Track]:
     """Return the people in order of appearance: by the file's own numbers, else by distance from frame to frame."""
-    identities = [[one.identity for one in frame if one.identity is not None] for frame in frames]
+    identities = [[detection.identity for detection in frame if detection.identity is not None] for frame in frames]
     # Without its tracker, AlphaPose gives everybody the same number.
-    if not any(identities) or any(len(set(each)) < len(each) for each in identities):
-        return _followed(frames, rate)
+    if not any(identities) or any(
+        len(set(frame_identities)) < len(frame_identities) for frame_identities in identities
+    ):
+        return _tracks_by_distance(frames, rate)
     tracks: dict[float, _Track] = {}
     for number, frame in enumerate(frames):
-        for one in frame:
-            if one.identity is not None:
-                tracks.setdefault(one.identity, {})[number] = one
+        for detection in frame:
+            if detection.identity is not None:
+                tracks.setdefault(detection.identity, {})[number] = detection
     return list(tracks.values())
 
 
-def _followed(frames: list[list[_Detection]], rate: float) -> list[_Track]:
+def _tracks_by_distance(frames: list[list[_Detection]], rate: float) -> list[_Track]:
     tracks: list[_Track] = []
     sizes: list[float] = []  # of each person, the largest so far [px]
     for number, frame in enumerate(frames):
-        seen = [float(np.linalg.norm(np.ptp(_box(one.points), axis=0))) for one in frame]
-        ages = [number - next(reversed(track)) for track in tracks]
-        recent = [which for which, age in enumerate(ages) if age - 1 <= _LOST * rate]
+        detected_sizes = [float(np.linalg.norm(np.ptp(_box(detection.points), axis=0))) for detection in frame]
+        ages = [number - next(reversed(track_frames)) for track_frames in tracks]
+        recent = [track for track, age in enumerate(ages) if age - 1 <= _LOST_SECONDS * rate]
         # Relative to the reach: a person who was lost for long must not take the place of one who is still there.
         costs = np.ones((len(recent), len(frame)))
-        for row, which in enumerate(recent):
-            last, reach = tracks[which][number - ages[which]], _LEAP + _PACE * ages[which] / rate
-            for column, one in enumerate(frame):
-                far = _distance(last.points, one.points) / max(sizes[which], seen[column], 1.0)
-                costs[row, column] = min(far / reach, 1.0)
+        for row, track in enumerate(recent):
+            last, reach = tracks[track][number - ages[track]], _REACH_AT_ONCE + _REACH_PER_SECOND * ages[track] / rate
+            for column, detection in enumerate(frame):
+                relative_distance = _distance(last.points, detection.points) / max(
+                    sizes[track], detected_sizes[column], 1.0
+                )
+                costs[row, column] = min(relative_distance / reach, 1.0)
         pairs = zip(*linear_sum_assignment(costs), strict=True)
-        followed = {column: recent[row] for row, column in pairs if costs[row, column] < 1.0}
-        for column, one in enumerate(frame):
-            which = followed.get(column, len(tracks))
-            if which == len(tracks):
+        track_of_column = {column: recent[row] for row, column in pairs if costs[row, column] < 1.0}
+        for column, detection in enumerate(frame):
+            track = track_of_column.get(column, len(tracks))
+            if track == len(tracks):
                 tracks.append({})
                 sizes.append(0.0)
-            tracks[which][number] = one
-            sizes[which] = max(sizes[which], seen[column])
+            tracks[track][number] = detection
+            sizes[track] = max(sizes[track], detected_sizes[column])
     return tracks
 
 
 def _distance(points: np.ndarray, others: np.ndarray) -> float:
     """Return the mean distance [px] of the points that both have, weighted by confidence; infinite without any."""
     weights = points[:, 2] * others[:, 2]
-    both = weights > 0.0
-    if not both.any():
+    in_both = weights > 0.0
+    if not in_both.any():
         return np.inf
-    return float(np.average(np.linalg.norm(points[both, :2] - others[both, :2], axis=-1), weights=weights[both]))
+    return float(
+        np.average(np.linalg.norm(points[in_both, :2] - others[in_both, :2], axis=-1), weights=weights[in_both])
+    )
 
 
 def _box(points: np.ndarray) -> np.ndarray:
     """Return the upper left and lower right corner (2, 2) [px] of the box around the detected points."""
-    found = points[points[:, 2] > 0.0, :2]
-    return np.array([found.min(axis=0), found.max(axis=0)])
+    detected = points[points[:, 2] > 0.0, :2]
+    return np.array([detected.min(axis=0), detected.max(axis=0)])
 
 
 def _prominence(track: _Track) -> float:
-    return sum(float(one.points[:, 2].mean() * np.ptp(_box(one.points)[:, 1])) for one in track.values())
+    return sum(
+        float(detection.points[:, 2].mean() * np.ptp(_box(detection.points)[:, 1])) for detection in track.values()
+    )
 
 
-def _crossed(one: _Detection, frame: list[_Detection]) -> bool:
-    own = _box(one.points)
-    for box in [_box(other.points) for other in frame if other is not one]:
-        shared = (np.minimum(box[1], own[1]) - np.maximum(box[0], own[0])).clip(0.0)
-        if np.prod(shared) > 0.5 * min(np.prod(np.ptp(each, axis=0)) for each in (box, own)):
+def _is_crossed(detection: _Detection, frame: list[_Detection]) -> bool:
+    own_box = _box(detection.points)
+    for box in [_box(other.points) for other in frame if other is not detection]:
+        overlap = (np.minimum(box[1], own_box[1]) - np.maximum(box[0], own_box[0])).clip(0.0)
+        if np.prod(overlap) > 0.5 * min(np.prod(np.ptp(corners, axis=0)) for corners in (box, own_box)):
             return True
     return False

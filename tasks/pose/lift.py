@@ -12,7 +12,7 @@
 rho is Geman and McClure's, m and S are those of the project's own motions, a_ft says how likely a foot stands (both by
 iteratively reweighted least squares); c is the centre of mass and p the mean position of the feet that stand.
 
-Starting from frames solved alone (`pose.alone`), all frames are solved together by Levenberg-Marquardt steps,
+Starting from frames solved alone (`pose.per_frame`), all frames are solved together by Levenberg-Marquardt steps,
 whose matrix is banded with a border (`pose.banded`).
 """
 
@@ -29,37 +29,37 @@ from scipy.spatial.transform import Rotation
 
 from tasks.pose.banded import Banded
 from tasks.pose.camera import Camera
-from tasks.pose.figure import SHARED, SOLE, USUAL, Figure, Pose, figure
-from tasks.pose.image import COMMON, HEIGHT, ROLL, TILT, moved, seen_by
-from tasks.pose.per_frame import Alone
+from tasks.pose.figure import SHARED, SOLE_HEIGHT, USUAL_HEIGHT, Figure, Pose, figure
+from tasks.pose.image import HEIGHT_STD, ROLL_STD, SHARED_VALUES, TILT_STD, estimated_camera, points_and_places
+from tasks.pose.per_frame import PerFrameFit
 from tasks.pose.points import FEET, POINTS, SIDES, Keypoints
-from tasks.pose.prior import within
+from tasks.pose.prior import prior_residuals
 from tasks.pose.rows import by_rows, single
 
 # Standard deviations: of a detector's points, as a share of the image's larger side; of the body's size, as a share.
-PIXELS, GROWN = 0.004, 0.06
+PIXEL_STD, SIZE_STD = 0.004, 0.06
 # Standard deviations of `figure.PROPORTIONS` and of the shoulders' shift: detectors place hips and trunks with a bias,
 # limbs differ little.
-VARIED = (0.15, 0.15, 0.15, 0.15, 0.06, 0.12, 0.06, 0.06, 0.1, 0.15)
+PROPORTION_STD = (0.15, 0.15, 0.15, 0.15, 0.06, 0.12, 0.06, 0.06, 0.1, 0.15)
 LIMBS = ("upper_arm", "lower_arm"), ("thigh", "shin", "foot")
 # Scales of accelerations [m/s^2]: trunk and head, arms and legs.
-TRUNK = 12.0
-QUICK = {"elbow": 40.0, "wrist": 40.0, "knee": 50.0, "ankle": 50.0, "heel": 50.0, "toe": 50.0}
+TRUNK_ACCELERATION = 12.0
+ACCELERATIONS = {"elbow": 40.0, "wrist": 40.0, "knee": 50.0, "ankle": 50.0, "heel": 50.0, "toe": 50.0}
 # Scales of a standing foot's speed [m/s], of its height and of its depth in the ground [m]; speed [m/s] and height [m]
 # at which a foot may stand.
-STILL, LEVEL, SUNK, SLOW, LOW = 0.10, 0.015, 0.005, 0.8, 0.08
+FOOT_SPEED, FOOT_HEIGHT, FOOT_DEPTH, STANDING_SPEED, STANDING_HEIGHT = 0.10, 0.015, 0.005, 0.8, 0.08
 # Residuals beyond this number of standard deviations are weighted down.
 OUTLIER = 6.0
 STEPS = 40
 # Standard deviation of the body's height, as a share, where the height is known or the camera is not. In the latter
 # case no image shows the scale and a small body accelerates least, so people are taken to be as tall as usual.
-UNSEEN = 0.005
+FIXED_HEIGHT_STD = 0.005
 # Standard deviation [m] of the centre of pressure around the feet that stand; mass nearest to each point, as a share.
-BORNE = 0.08
+PRESSURE_STD = 0.08
 MASSES = {"nose": 0.07, "shoulder": 0.16, "elbow": 0.035, "wrist": 0.02, "hip": 0.16, "knee": 0.06, "ankle": 0.03}
 GRAVITY = 9.81
 # Standard deviation of the height of a detector's heel and toe points in a foot that stands [m].
-SOLES = 0.02
+SOLE_STD = 0.02
 
 _SWAPS = (
     [[POINTS.index(f"{side}_{limb}") for limb in ("shoulder", "elbow", "wrist")] for side in SIDES],
@@ -70,8 +70,8 @@ _SWAPS = (
 class Lifted(NamedTuple):
     """Figure fitted to all frames.
 
-    pose: see `figure.Pose`. proportions: (11,), see `Figure`. camera: as given, or as estimated. error: median
-    reprojection error of the points that were seen [px].
+    pose: see `figure.Pose`. proportions: (11,), see `Figure`. camera: the film's, or as estimated. error: median
+    reprojection error of the detected points [px].
     """
 
     pose: Pose
@@ -80,219 +80,247 @@ class Lifted(NamedTuple):
     error: float
 
 
-class Now(NamedTuple):
+class PoseQuantities(NamedTuple):
     """Quantities that follow from a pose and the shared values.
 
-    points: (T, P, 3) [m]. places: (T, P, 2) [px]. unlike: `likely.within` (T, K). heights: of the soles (T, 4) [m].
+    points: (T, P, 3) [m]. places: (T, P, 2) [px]. prior: its residuals (T, K). heights: of the soles (T, 4) [m].
     """
 
     points: np.ndarray
     places: np.ndarray
-    unlike: np.ndarray
+    prior: np.ndarray
     heights: np.ndarray
 
 
-class Term(NamedTuple):
+class ResidualTerm(NamedTuple):
     """Residuals (F, K) with weights (F, K), and derivatives (F, K, D + S) by frames f + offset and shared values."""
 
     weights: np.ndarray
-    residual: Callable[[Now], np.ndarray]
-    slopes: tuple[tuple[int, np.ndarray], ...]
+    residual: Callable[[PoseQuantities], np.ndarray]
+    derivatives: tuple[tuple[int, np.ndarray], ...]
 
 
-class _Lifter:
+class _FilmFit:
     """Least-squares problem of one film."""
 
-    def __init__(self, keypoints: Keypoints, camera: Camera, known: bool, height: float | None) -> None:
-        self.keypoints, self.camera, self.known, self.figure = keypoints, camera, known, figure()
+    def __init__(self, keypoints: Keypoints, camera: Camera, position_known: bool, height: float | None) -> None:
+        self.keypoints, self.camera, self.position_known, self.figure = keypoints, camera, position_known, figure()
         self.sigma = noise(keypoints, camera)
-        self.alone = Alone(keypoints, camera, self.sigma)
-        unknown = (1e-4, 1e-4, 1e-4) if known else (TILT, ROLL, HEIGHT)
-        if height is None and not known:
-            height = USUAL
-        seconds, sigma = len(keypoints) / keypoints.rate, np.array([GROWN, *VARIED, *unknown, SOLES, SOLES])
-        self.usual, self.prior = np.zeros(COMMON), seconds * np.diag(1.0 / sigma**2)
+        self.per_frame = PerFrameFit(keypoints, camera, self.sigma)
+        camera_std = (1e-4, 1e-4, 1e-4) if position_known else (TILT_STD, ROLL_STD, HEIGHT_STD)
+        if height is None and not position_known:
+            height = USUAL_HEIGHT
+        duration, std = (
+            len(keypoints) / keypoints.rate,
+            np.array([SIZE_STD, *PROPORTION_STD, *camera_std, SOLE_STD, SOLE_STD]),
+        )
+        self.usual, self.prior = np.zeros(SHARED_VALUES), duration * np.diag(1.0 / std**2)
         if height is not None:  # a prior on the height, which depends on all proportions
-            along = np.zeros(COMMON)
-            along[:SHARED] = jax.grad(self.figure.height)(jnp.zeros(SHARED)) / USUAL
-            self.usual[0] = np.log(height / USUAL)
-            self.prior += seconds * np.outer(along, along) / UNSEEN**2
+            gradient = np.zeros(SHARED_VALUES)
+            gradient[:SHARED] = jax.grad(self.figure.height)(jnp.zeros(SHARED)) / USUAL_HEIGHT
+            self.usual[0] = np.log(height / USUAL_HEIGHT)
+            self.prior += duration * np.outer(gradient, gradient) / FIXED_HEIGHT_STD**2
 
-    def solved(self) -> tuple[Pose, np.ndarray]:
+    def solve(self) -> tuple[Pose, np.ndarray]:
         """Return the pose and the shared values (S,)."""
-        begin = self.usual if self.known else self.alone.tilted(self.usual)
-        pose, shared = self.together(self.alone.first(begin), begin, STEPS // 2)
+        first_values = self.usual if self.position_known else self.per_frame.with_tilt(self.usual)
+        pose, shared = self.solve_together(self.per_frame.first_pose(first_values), first_values, STEPS // 2)
         names = [self.figure.body.links[child].name for child, _, _ in self.figure.body.motors]
         for side in SIDES:
             for limb in LIMBS:
-                pose = self.alone.rethought(pose, shared, tuple(names.index(f"{side}_{each}") for each in limb))
-        return self.together(pose, shared, STEPS)
+                pose = self.per_frame.with_limb_solved(
+                    pose, shared, tuple(names.index(f"{side}_{link}") for link in limb)
+                )
+        return self.solve_together(pose, shared, STEPS)
 
-    def together(self, pose: Pose, shared: np.ndarray, steps: int) -> tuple[Pose, np.ndarray]:
+    def solve_together(self, pose: Pose, shared: np.ndarray, steps: int) -> tuple[Pose, np.ndarray]:
         """Return the pose and the shared values (S,) after at most `steps` steps on all frames together."""
         places, confidence = self.keypoints.places, self.keypoints.confidence
-        for again in range(3):
+        for round_ in range(3):
             damping = 1e-2
-            if again:
-                places, confidence = self._unswapped(pose, shared, places, confidence)
+            if round_:
+                places, confidence = self._sides_corrected(pose, shared, places, confidence)
             for _ in range(steps // 3):
                 terms = self.terms(pose, shared, places, confidence)
-                normal = Banded(len(pose.place), 6 + 3 * self.figure.joints, len(shared))
+                normal_equations = Banded(len(pose.place), 6 + 3 * self.figure.joints, len(shared))
 
-                def cost(now: Now, shared: np.ndarray, terms: list[Term] = terms) -> float:
-                    unusual = shared - self.usual
-                    fit = sum(float(np.sum(weights * of(now) ** 2)) for weights, of, _ in terms)
-                    return fit + float(unusual @ self.prior @ unusual)
+                def cost(quantities: PoseQuantities, shared: np.ndarray, terms: list[ResidualTerm] = terms) -> float:
+                    deviation = shared - self.usual
+                    squares = sum(
+                        float(np.sum(weights * residual_of(quantities) ** 2)) for weights, residual_of, _ in terms
+                    )
+                    return squares + float(deviation @ self.prior @ deviation)
 
-                here = self.now(pose, shared)
-                for weights, residual, slopes in terms:
-                    normal.add(weights, residual(here), slopes)
-                normal.share(self.prior, shared - self.usual)
+                current = self.quantities(pose, shared)
+                for weights, residual, derivatives in terms:
+                    normal_equations.add(weights, residual(current), derivatives)
+                normal_equations.add_prior(self.prior, shared - self.usual)
                 for _ in range(8):
-                    change, common = normal.solved(damping)
-                    there = _after(pose, change)
-                    if cost(self.now(there, shared + common), shared + common) < cost(here, shared):
-                        pose, shared, damping = there, shared + common, max(0.3 * damping, 1e-6)
+                    step, shared_step = normal_equations.solve(damping)
+                    next_pose = _stepped(pose, step)
+                    if cost(self.quantities(next_pose, shared + shared_step), shared + shared_step) < cost(
+                        current, shared
+                    ):
+                        pose, shared, damping = next_pose, shared + shared_step, max(0.3 * damping, 1e-6)
                         break
                     damping *= 5.0
                 else:
-                    break  # nothing gains any more
+                    break  # no step lowers the cost any more
         return pose, shared
 
-    def _unswapped(
+    def _sides_corrected(
         self, pose: Pose, shared: np.ndarray, places: np.ndarray, confidence: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the places and confidence of keypoints, left and right exchanged where they then fit better."""
-        found = self.now(pose, shared).places
+        fitted = self.quantities(pose, shared).places
         places, confidence = places.copy(), confidence.copy()
         for left, right in _SWAPS:
-            own, other = left + right, right + left
+            side_rows, other_rows = left + right, right + left
 
-            def misfit(rows: list[int], own: list[int] = own) -> np.ndarray:
-                apart = np.linalg.norm(found[:, own] - places[:, rows], axis=-1) / self.sigma
-                return np.nansum(np.minimum(apart, 20.0) * confidence[:, rows], axis=1)
+            def misfit(rows: list[int], side_rows: list[int] = side_rows) -> np.ndarray:
+                distances = np.linalg.norm(fitted[:, side_rows] - places[:, rows], axis=-1) / self.sigma
+                return np.nansum(np.minimum(distances, 20.0) * confidence[:, rows], axis=1)
 
-            worse = misfit(own) > 1.3 * misfit(other) + 10.0
-            places[:, own] = np.where(worse[:, None, None], places[:, other], places[:, own])
-            confidence[:, own] = np.where(worse[:, None], confidence[:, other], confidence[:, own])
+            is_swapped = misfit(side_rows) > 1.3 * misfit(other_rows) + 10.0
+            places[:, side_rows] = np.where(is_swapped[:, None, None], places[:, other_rows], places[:, side_rows])
+            confidence[:, side_rows] = np.where(
+                is_swapped[:, None], confidence[:, other_rows], confidence[:, side_rows]
+            )
         return places, confidence
 
-    def terms(self, pose: Pose, shared: np.ndarray, places: np.ndarray, confidence: np.ndarray) -> list[Term]:
+    def terms(self, pose: Pose, shared: np.ndarray, places: np.ndarray, confidence: np.ndarray) -> list[ResidualTerm]:
         """Return the residual terms around a pose, with weights and derivatives evaluated there."""
         frames, count, rate = len(pose.place), len(POINTS), self.keypoints.rate
-        now = self.now(pose, shared)
-        x, y, of_unlike = self.derivatives(pose, shared)
-        each = 30.0 / rate  # neighbouring frames at a high frame rate add little information
-        seen = (confidence > 0.0)[..., None]
+        quantities = self.quantities(pose, shared)
+        of_points, of_places, of_prior = self.derivatives(pose, shared)
+        frame_weight = 30.0 / rate  # neighbouring frames at a high frame rate add little information
+        is_detected = (confidence > 0.0)[..., None]
 
-        def image(now: Now) -> np.ndarray:
-            return (np.where(seen, now.places - np.nan_to_num(places), 0.0) / self.sigma).reshape(frames, -1)
+        def image(quantities: PoseQuantities) -> np.ndarray:
+            return (np.where(is_detected, quantities.places - np.nan_to_num(places), 0.0) / self.sigma).reshape(
+                frames, -1
+            )
 
-        apart = image(now).reshape(frames, count, 2)
-        trusted = each * confidence / (1.0 + (apart**2).sum(axis=-1) / OUTLIER**2) ** 2
-        quick = np.array([QUICK.get(name.partition("_")[2], TRUNK) for name in POINTS]) / rate**2
-        jerk = each / quick**2 / np.sqrt(1.0 + (second_differences(now.points) ** 2).sum(axis=-1) / quick**2)
-        feet, height = now.points[:, FEET], now.heights
+        image_residuals = image(quantities).reshape(frames, count, 2)
+        image_weights = frame_weight * confidence / (1.0 + (image_residuals**2).sum(axis=-1) / OUTLIER**2) ** 2
+        scales = np.array([ACCELERATIONS.get(name.partition("_")[2], TRUNK_ACCELERATION) for name in POINTS]) / rate**2
+        acceleration_weights = (
+            frame_weight
+            / scales**2
+            / np.sqrt(1.0 + (second_differences(quantities.points) ** 2).sum(axis=-1) / scales**2)
+        )
+        feet, heights = quantities.points[:, FEET], quantities.heights
         speed = np.linalg.norm(np.diff(feet, axis=0), axis=-1) * rate
         speed = np.minimum(np.concatenate([speed[:1], speed]), np.concatenate([speed, speed[-1:]]))
-        stands = np.exp(-((np.maximum(height, 0.0) / LOW) ** 2)) / (1.0 + (speed / SLOW) ** 2) ** 2
-        still = each * np.minimum(stands[1:], stands[:-1]) / (STILL / rate) ** 2
-        rows = [3 * foot + axis for foot in FEET for axis in range(3)]
-        of_heights = x[:, [3 * foot + 2 for foot in FEET]]
+        standing = (
+            np.exp(-((np.maximum(heights, 0.0) / STANDING_HEIGHT) ** 2)) / (1.0 + (speed / STANDING_SPEED) ** 2) ** 2
+        )
+        foot_weights = frame_weight * np.minimum(standing[1:], standing[:-1]) / (FOOT_SPEED / rate) ** 2
+        foot_rows = [3 * foot + axis for foot in FEET for axis in range(3)]
+        of_heights = of_points[:, [3 * foot + 2 for foot in FEET]]
         of_heights[:, [0, 2], -2] -= 1.0
         of_heights[:, [1, 3], -1] -= 1.0
         return [
-            Term(np.repeat(trusted, 2, axis=1), image, ((0, y / self.sigma),)),
-            Term(
-                np.repeat(jerk, 3, axis=1), lambda now: second_differences(now.points).reshape(frames - 2, -1),
-                ((0, x[:-2]), (1, -2.0 * x[1:-1]), (2, x[2:])),
+            ResidualTerm(np.repeat(image_weights, 2, axis=1), image, ((0, of_places / self.sigma),)),
+            ResidualTerm(
+                np.repeat(acceleration_weights, 3, axis=1),
+                lambda quantities: second_differences(quantities.points).reshape(frames - 2, -1),
+                ((0, of_points[:-2]), (1, -2.0 * of_points[1:-1]), (2, of_points[2:])),
             ),
-            Term(
-                np.repeat(still, 3, axis=1), lambda now: np.diff(now.points[:, FEET], axis=0).reshape(frames - 1, -1),
-                ((0, -x[:-1, rows]), (1, x[1:, rows])),
+            ResidualTerm(
+                np.repeat(foot_weights, 3, axis=1),
+                lambda quantities: np.diff(quantities.points[:, FEET], axis=0).reshape(frames - 1, -1),
+                ((0, -of_points[:-1, foot_rows]), (1, of_points[1:, foot_rows])),
             ),
-            Term(
-                each * (stands / LEVEL**2 + (height < 0.0) / SUNK**2), lambda now: now.heights, ((0, of_heights),)
+            ResidualTerm(
+                frame_weight * (standing / FOOT_HEIGHT**2 + (heights < 0.0) / FOOT_DEPTH**2),
+                lambda quantities: quantities.heights,
+                ((0, of_heights),),
             ),
-            self.balance(now, stands, x),
-            Term(np.full(now.unlike.shape, each), lambda now: now.unlike, ((0, of_unlike),)),
-        ]  # fmt: skip
+            self.balance(quantities, standing, of_points),
+            ResidualTerm(
+                np.full(quantities.prior.shape, frame_weight), lambda quantities: quantities.prior, ((0, of_prior),)
+            ),
+        ]
 
-    def balance(self, now: Now, stands: np.ndarray, x: np.ndarray) -> Term:
+    def balance(self, quantities: PoseQuantities, standing: np.ndarray, of_points: np.ndarray) -> ResidualTerm:
         """Return the residuals of balance, x'' = (x - p) g / z: a body that no foot supports falls over.
 
-        x is the centre of mass at height z, p the centre of pressure, the mean of the feet weighted by `stands`.
+        x is the centre of mass at height z, p the centre of pressure, the mean of the feet weighted by `standing`.
         """
         rate, mass = self.keypoints.rate, np.array([MASSES.get(name.rpartition("_")[2], 0.0) for name in POINTS])
         mass /= mass.sum()
-        share = stands[1:-1] + 1e-9
+        share = standing[1:-1] + 1e-9
         share = share / share.sum(axis=1, keepdims=True)
-        feet = now.points[1:-1, FEET, :2]
-        apart = feet - (share[..., None] * feet).sum(axis=1, keepdims=True)
-        variance = BORNE**2 + (share * (apart**2).sum(axis=-1)).sum(axis=1)
-        weights = 30.0 / rate * stands[1:-1].max(axis=1) / variance
-        pace = (np.maximum(now.points[1:-1, :, 2] @ mass, 0.3) * rate**2 / GRAVITY)[:, None]
+        feet = quantities.points[1:-1, FEET, :2]
+        offsets = feet - (share[..., None] * feet).sum(axis=1, keepdims=True)
+        variance = PRESSURE_STD**2 + (share * (offsets**2).sum(axis=-1)).sum(axis=1)
+        weights = 30.0 / rate * standing[1:-1].max(axis=1) / variance
+        factor = (np.maximum(quantities.points[1:-1, :, 2] @ mass, 0.3) * rate**2 / GRAVITY)[:, None]
 
-        def unborne(now: Now) -> np.ndarray:
-            middle = np.einsum("p,tpx->tx", mass, now.points[..., :2])
-            held = (share[..., None] * now.points[1:-1, FEET, :2]).sum(axis=1)
-            return middle[1:-1] - held - pace * second_differences(middle)
+        def residual(quantities: PoseQuantities) -> np.ndarray:
+            centre = np.einsum("p,tpx->tx", mass, quantities.points[..., :2])
+            pressure = (share[..., None] * quantities.points[1:-1, FEET, :2]).sum(axis=1)
+            return centre[1:-1] - pressure - factor * second_differences(centre)
 
-        by_point = x.reshape(len(x), len(POINTS), 3, -1)[:, :, :2]
-        of_middle = np.einsum("p,tpxd->txd", mass, by_point)
+        by_point = of_points.reshape(len(of_points), len(POINTS), 3, -1)[:, :, :2]
+        of_centre = np.einsum("p,tpxd->txd", mass, by_point)
         of_feet = (share[..., None, None] * by_point[1:-1, FEET]).sum(axis=1)
-        along = pace[..., None]
-        return Term(
+        factor_by_value = factor[..., None]
+        return ResidualTerm(
             np.repeat(weights[:, None], 2, axis=1),
-            unborne,
+            residual,
             (
-                (0, -along * of_middle[:-2]),
-                (1, (1.0 + 2.0 * along) * of_middle[1:-1] - of_feet),
-                (2, -along * of_middle[2:]),
+                (0, -factor_by_value * of_centre[:-2]),
+                (1, (1.0 + 2.0 * factor_by_value) * of_centre[1:-1] - of_feet),
+                (2, -factor_by_value * of_centre[2:]),
             ),
         )
 
-    def now(self, pose: Pose, shared: np.ndarray) -> Now:
+    def quantities(self, pose: Pose, shared: np.ndarray) -> PoseQuantities:
         """Return the quantities that follow from a pose and the shared values (S,)."""
-        points, places, unlike = self.by_frames(_all_followed, pose, shared)
-        return Now(points, places, unlike, points[:, FEET, 2] - SOLE - np.tile(shared[-2:], 2))
+        points, places, prior = self.by_frames(_all_quantities, pose, shared)
+        return PoseQuantities(points, places, prior, points[:, FEET, 2] - SOLE_HEIGHT - np.tile(shared[-2:], 2))
 
     def derivatives(self, pose: Pose, shared: np.ndarray) -> list[np.ndarray]:
         """Return derivatives by pose and shared values.
 
-        They are those of points (T, 3 P, D + S), places (T, 2 P, D + S) and `likely.within` (T, K, D + S).
+        They are those of points (T, 3 P, D + S), places (T, 2 P, D + S) and prior residuals (T, K, D + S).
         """
-        found = self.by_frames(_all_slopes, pose, shared)
-        return [each.reshape(len(each), -1, each.shape[-1]) for each in found]
+        stacked = self.by_frames(_all_derivatives, pose, shared)
+        return [derivatives.reshape(len(derivatives), -1, derivatives.shape[-1]) for derivatives in stacked]
 
     def by_frames(self, function: Callable[..., Any], pose: Pose, shared: np.ndarray) -> Any:
-        """Return the result of a compiled `_followed` or `_slopes` for all frames."""
-        still = np.zeros_like(pose.place)
-        change = np.concatenate([pose.place, still, pose.angles.reshape(len(pose.place), -1)], axis=1)
-        camera, common = single((self.camera, shared))
-        return by_rows(lambda turn, change: function(self.figure, camera, turn, change, common), pose.turn, change)
+        """Return the result of a compiled `_frame_quantities` or `_frame_derivatives` for all frames."""
+        no_rotation = np.zeros_like(pose.place)
+        change = np.concatenate([pose.place, no_rotation, pose.angles.reshape(len(pose.place), -1)], axis=1)
+        camera, shared_values = single((self.camera, shared))
+        return by_rows(
+            lambda turn, change: function(self.figure, camera, turn, change, shared_values), pose.turn, change
+        )
 
 
-def _followed(body: Figure, camera: Camera, turn: Array, change: Array, shared: Array) -> tuple[Array, ...]:
+def _frame_quantities(body: Figure, camera: Camera, turn: Array, change: Array, shared: Array) -> tuple[Array, ...]:
     """Return points (P, 3) [m] of one frame, their places (P, 2) [px], and the prior residuals (K,) of its pose."""
-    return *moved(body, camera, turn, change, shared), within(body, turn, change)
+    return *points_and_places(body, camera, turn, change, shared), prior_residuals(body, turn, change)
 
 
-def _slopes(body: Figure, camera: Camera, turn: Array, change: Array, shared: Array) -> tuple[Array, ...]:
-    """Return the derivatives of `_followed` by change and shared values (D + S,), on their last axis."""
-    both = jax.jacfwd(_followed, (3, 4))(body, camera, turn, change, shared)
-    return tuple(jnp.concatenate(each, axis=-1) for each in both)
+def _frame_derivatives(body: Figure, camera: Camera, turn: Array, change: Array, shared: Array) -> tuple[Array, ...]:
+    """Return the derivatives of `_frame_quantities` by change and shared values (D + S,), on their last axis."""
+    by_argument = jax.jacfwd(_frame_quantities, (3, 4))(body, camera, turn, change, shared)
+    return tuple(jnp.concatenate(parts, axis=-1) for parts in by_argument)
 
 
 # Compiled for many frames at once; cameras are arguments, or each would be compiled anew.
-_all_followed, _all_slopes = (
-    jax.jit(jax.vmap(each, (None, None, 0, 0, None)), static_argnums=0) for each in (_followed, _slopes)
+_all_quantities, _all_derivatives = (
+    jax.jit(jax.vmap(function, (None, None, 0, 0, None)), static_argnums=0)
+    for function in (_frame_quantities, _frame_derivatives)
 )
 
 
 def noise(keypoints: Keypoints, camera: Camera) -> float:
     """Return the standard deviation [px] of detected keypoints."""
-    return PIXELS * float(max(keypoints.size or 2.0 * np.asarray(camera.centre)))
+    return PIXEL_STD * float(max(keypoints.size or 2.0 * np.asarray(camera.centre)))
 
 
 def second_differences(values: np.ndarray) -> np.ndarray:
@@ -300,20 +328,20 @@ def second_differences(values: np.ndarray) -> np.ndarray:
     return values[2:] - 2.0 * values[1:-1] + values[:-2]
 
 
-def _after(pose: Pose, change: np.ndarray) -> Pose:
+def _stepped(pose: Pose, change: np.ndarray) -> Pose:
     """Return the pose after a step (T, D) of place, turn and angles."""
     turn = Rotation.from_rotvec(change[:, 3:6]).as_matrix() @ pose.turn
     return Pose(pose.place + change[:, :3], turn, pose.angles + change[:, 6:].reshape(pose.angles.shape))
 
 
-def lift(keypoints: Keypoints, camera: Camera, known: bool = True, height: float | None = None) -> Lifted:
+def lift(keypoints: Keypoints, camera: Camera, position_known: bool = True, height: float | None = None) -> Lifted:
     """Return the figure fitted to all frames, of which the first and the last must show most of a person.
 
-    known: whether the camera's position is known; else its tilt and height are estimated, starting from the given ones.
+    position_known: whether the camera's position is known; else its tilt and height are estimated, from its own ones.
     height: of the person [m], where it is known; the usual one by default where the camera is not known.
     """
-    lifter = _Lifter(keypoints, camera, known, height)
-    pose, shared = lifter.solved()
-    apart = np.linalg.norm(lifter.now(pose, shared).places - keypoints.places, axis=-1)
-    found = camera if known else seen_by(camera, shared)
-    return Lifted(pose, shared[:SHARED], found, float(np.nanmedian(apart)))
+    film_fit = _FilmFit(keypoints, camera, position_known, height)
+    pose, shared = film_fit.solve()
+    distances = np.linalg.norm(film_fit.quantities(pose, shared).places - keypoints.places, axis=-1)
+    fitted_camera = camera if position_known else estimated_camera(camera, shared)
+    return Lifted(pose, shared[:SHARED], fitted_camera, float(np.nanmedian(distances)))

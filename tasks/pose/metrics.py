@@ -28,46 +28,46 @@ def pelvis(points: np.ndarray) -> np.ndarray:
     return points[..., HIPS, :].mean(axis=-2, keepdims=True)
 
 
-def position_errors(found: np.ndarray, true: np.ndarray) -> dict[str, float]:
+def position_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
     """Return mean joint errors [mm] of points (T, P, 3) [m]: `mpjpe_g_mm`, `mpjpe_mm` and `mpjpe_pa_mm`.
 
     They are aligned by the pelvis of the first frame in which it is known, by the pelvis of each frame, and by each
     frame's best rotation, translation and scale (Procrustes).
     """
 
-    def mean(one: np.ndarray, other: np.ndarray) -> float:
-        return 1e3 * float(np.nanmean(np.linalg.norm(one[:, JOINTS] - other[:, JOINTS], axis=-1)))
+    def mean(first_points: np.ndarray, second_points: np.ndarray) -> float:
+        return 1e3 * float(np.nanmean(np.linalg.norm(first_points[:, JOINTS] - second_points[:, JOINTS], axis=-1)))
 
-    aligned = np.stack([procrustes(each, wanted) for each, wanted in zip(found, true, strict=True)])
+    aligned = np.stack([procrustes(points, true_points) for points, true_points in zip(estimated, true, strict=True)])
     first = int(np.argmax(np.isfinite(pelvis(true)).all(axis=(1, 2))))
     return {
-        "mpjpe_g_mm": mean(found - pelvis(found[first]), true - pelvis(true[first])),
-        "mpjpe_mm": mean(found - pelvis(found), true - pelvis(true)),
+        "mpjpe_g_mm": mean(estimated - pelvis(estimated[first]), true - pelvis(true[first])),
+        "mpjpe_mm": mean(estimated - pelvis(estimated), true - pelvis(true)),
         "mpjpe_pa_mm": mean(aligned, true),
     }
 
 
-def procrustes(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+def procrustes(estimated: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Return points (P, 3) rotated, translated and scaled so that their joints best fit the true ones.
 
     All are NaN where fewer than three of the true joints are known.
     """
-    known = [row for row in JOINTS if np.isfinite(true[row]).all()]
-    if len(known) < 3:
-        return np.full_like(found, np.nan)
-    own, other = found[known], true[known]
-    middle, wanted = own.mean(axis=0), other.mean(axis=0)
-    turn, _ = Rotation.align_vectors(other - wanted, own - middle)
-    turned = turn.apply(own - middle)
-    scale = np.sum(turned * (other - wanted)) / np.sum(turned**2)
-    return scale * turn.apply(found - middle) + wanted
+    known_rows = [row for row in JOINTS if np.isfinite(true[row]).all()]
+    if len(known_rows) < 3:
+        return np.full_like(estimated, np.nan)
+    estimated_joints, true_joints = estimated[known_rows], true[known_rows]
+    estimated_mean, true_mean = estimated_joints.mean(axis=0), true_joints.mean(axis=0)
+    rotation, _ = Rotation.align_vectors(true_joints - true_mean, estimated_joints - estimated_mean)
+    rotated = rotation.apply(estimated_joints - estimated_mean)
+    scale = np.sum(rotated * (true_joints - true_mean)) / np.sum(rotated**2)
+    return scale * rotation.apply(estimated - estimated_mean) + true_mean
 
 
-def velocity_error(found: np.ndarray, true: np.ndarray, rate: float) -> float:
+def velocity_error(estimated: np.ndarray, true: np.ndarray, rate: float) -> float:
     """Return the mean error [m/s] of joint velocities of points (T, P, 3) [m], aligned by the pelvis of each frame."""
-    both = ((each - pelvis(each))[:, JOINTS] for each in (found, true))
-    one, other = (rate * np.diff(each, axis=0) for each in both)
-    return float(np.nanmean(np.linalg.norm(one - other, axis=-1)))
+    aligned = ((points - pelvis(points))[:, JOINTS] for points in (estimated, true))
+    velocities, true_velocities = (rate * np.diff(points, axis=0) for points in aligned)
+    return float(np.nanmean(np.linalg.norm(velocities - true_velocities, axis=-1)))
 
 
 def foot_skate(points: np.ndarray) -> float:
@@ -79,9 +79,9 @@ def foot_skate(points: np.ndarray) -> float:
         return np.nan
     skating = np.zeros(len(points) - 1, bool)
     for rows in FEET.values():
-        low: np.ndarray = np.all(points[:, rows, 2] < CONTACT, axis=1)
+        in_contact: np.ndarray = np.all(points[:, rows, 2] < CONTACT, axis=1)
         moved = np.linalg.norm(np.diff(points[:, rows].mean(axis=1), axis=0), axis=-1)
-        skating = np.logical_or(skating, low[:-1] & low[1:] & (moved > SKATE))
+        skating = np.logical_or(skating, in_contact[:-1] & in_contact[1:] & (moved > SKATE))
     return 100.0 * float(skating.mean())
 
 

@@ -31,23 +31,23 @@ from larp_model.scene import Body, Scene, anchor
 from mpc import CostTerm, Dynamics, GaussNewton, Optimizer, Planner, Verified, quadratic
 from mpc.loop import Checkpoint, Execution, Phase, Window, execute
 from tasks.exploration import exploration_std
-from tasks.motions.references import clearance, leading, spinning
+from tasks.motions.references import clearance, with_angular_velocities, with_servo_lead
 from tasks.pose.camera import Camera
 from tasks.pose.figure import Figure, Pose
-from tasks.pose.lift import OUTLIER, SLOW, Lifted, noise
+from tasks.pose.lift import OUTLIER, STANDING_SPEED, Lifted, noise
 from tasks.pose.points import FEET, POINTS, Keypoints, interpolated
 from tasks.presets import PresetName
 
 # Spread of a first plan, as a share of the training data's spread around its motions.
-SEARCH = 0.5
+SPREAD_SHARE = 0.5
 # Scales of the costs: distance [m] and velocity [m/s] from the kinematic start's, a standing foot's speed [m/s].
-NEAR, PACE, STILL = 0.05, 0.5, 0.3
+POSITION_SCALE, VELOCITY_SCALE, FOOT_SPEED_SCALE = 0.05, 0.5, 0.3
 
 
 class FitPreset(NamedTuple):
     """Budget of a fit: horizon of a plan [steps] and its knots, its optimiser, steps between plans.
 
-    verify: rounds in which each plan of a learned model is tried in the ground truth and corrected.
+    verify: rounds in which each plan of a learned model is executed in the ground truth and corrected.
     """
 
     horizon: int
@@ -57,7 +57,7 @@ class FitPreset(NamedTuple):
     verify: int = 0
 
     def optimizers(self, truth: Dynamics | None) -> tuple[Optimizer, ...]:
-        """Return the optimisers of a plan; truth: the ground truth that tries a model's plans, None to try none."""
+        """Return the optimisers of a plan; truth: the ground truth that verifies a model's plans, if any."""
         if truth is None or not self.verify:
             return (self.steps,)
         return self.steps, Verified(truth, replace(self.steps, rounds=1), self.verify, candidates=1)
@@ -71,102 +71,110 @@ PRESETS: dict[PresetName, FitPreset] = {
 }
 
 
-class WantedMotion(NamedTuple):
+class FilmedMotion(NamedTuple):
     """Motion that a film shows, at each of N steps.
 
     states (N, L, 13) and targets (N, J, 3) [rad] of the kinematic start; places (N, P, 2) [px] and weights (N, P) of
-    the keypoints; stands (N, 4), from 0 to 1, how likely heels and toes stand.
+    the keypoints; standing (N, 4), from 0 to 1, how likely heels and toes stand.
     """
 
     states: np.ndarray
     targets: np.ndarray
     places: np.ndarray
     weights: np.ndarray
-    stands: np.ndarray
+    standing: np.ndarray
 
 
-def wanted_of(scene: Scene, figure: Figure, lifted: Lifted, keypoints: Keypoints) -> WantedMotion:
+def filmed_motion(scene: Scene, figure: Figure, lifted: Lifted, keypoints: Keypoints) -> FilmedMotion:
     """Return the kinematic start and the keypoints, resampled to the steps of the scene."""
     human = scene.bodies[0]
-    begin, rate = keypoints.times, keypoints.rate
-    times = np.arange(int(begin[-1] / scene.dt + 1e-6) + 1) * scene.dt
+    frame_times, rate = keypoints.times, keypoints.rate
+    times = np.arange(int(frame_times[-1] / scene.dt + 1e-6) + 1) * scene.dt
     place = interpolated(lifted.pose.place, rate, times)
-    root = Slerp(begin, Rotation.from_matrix(lifted.pose.turn))(times)
+    root = Slerp(frame_times, Rotation.from_matrix(lifted.pose.turn))(times)
     angles = np.clip(interpolated(lifted.pose.angles, rate, times), figure.lower, figure.upper)
     states = np.zeros((len(times), len(human.links), packed.SIZE))
-    turns = [root]
+    rotations = [root]
     for child, joint in enumerate(human.joints, start=1):
-        turns.append(turns[joint.parent] * Rotation.from_rotvec(angles[:, child - 1]))
-    for row, turned in enumerate(turns):
-        states[:, row, packed.ORIENTATION] = turned.as_quat(scalar_first=True)
+        rotations.append(rotations[joint.parent] * Rotation.from_rotvec(angles[:, child - 1]))
+    for row, rotation in enumerate(rotations):
+        states[:, row, packed.ORIENTATION] = rotation.as_quat(scalar_first=True)
     states[:, 0, packed.POSITION] = place
     states[:, 0, packed.VELOCITY] = np.gradient(place, scene.dt, axis=0)
-    states = closed(scene, spinning(states, scene.dt))
+    states = closed(scene, with_angular_velocities(states, scene.dt))
 
-    seen = np.nan_to_num(keypoints.places)
-    found = lifted.camera.project(figure.all_points(lifted.pose, lifted.proportions))
-    apart = np.linalg.norm(found - seen, axis=-1) / noise(keypoints, lifted.camera)
-    trusted = keypoints.confidence / (1.0 + (apart / OUTLIER) ** 2) ** 2
+    places_detected = np.nan_to_num(keypoints.places)
+    places_of_figure = lifted.camera.project(figure.all_points(lifted.pose, lifted.proportions))
+    distances = np.linalg.norm(places_of_figure - places_detected, axis=-1) / noise(keypoints, lifted.camera)
+    weights = keypoints.confidence / (1.0 + (distances / OUTLIER) ** 2) ** 2
     nearest = np.minimum(np.rint(times * rate).astype(int), len(keypoints) - 1)
-    places = interpolated(np.where(keypoints.seen[..., None], seen, found), rate, times)
+    places = interpolated(np.where(keypoints.detected[..., None], places_detected, places_of_figure), rate, times)
     points = figure.all_points(Pose(place, root.as_matrix(), angles), lifted.proportions)[:, FEET]
     speed = np.linalg.norm(np.gradient(points, scene.dt, axis=0), axis=-1)
-    stands = np.exp(-((np.maximum(points[..., 2] - 0.03, 0.0) / 0.05) ** 2)) / (1.0 + (speed / SLOW) ** 2) ** 2
-    return WantedMotion(states, leading(scene, angles), places, trusted[nearest], stands)
+    standing = (
+        np.exp(-((np.maximum(points[..., 2] - 0.03, 0.0) / 0.05) ** 2)) / (1.0 + (speed / STANDING_SPEED) ** 2) ** 2
+    )
+    return FilmedMotion(states, with_servo_lead(scene, angles), places, weights[nearest], standing)
 
 
-class Seen:
-    """Points of a film on the human of a scene."""
+class BodyPoints:
+    """Places of `POINTS` on the links of a scene's human."""
 
     def __init__(self, human: Body, figure: Figure, proportions: np.ndarray) -> None:
         """Place the points; human: as simulated, its sizes may differ from those of the figure of these proportions."""
         sizes = np.asarray(figure.scaled(jnp.asarray(proportions)), float)
         self.links, local = np.array([figure.anchors[name][0] for name in POINTS]), []
         for name in POINTS:
-            link, at = figure.anchors[name]
+            link, anchor_point = figure.anchors[name]
             axis, joint = human.links[link].axis, human.joints[link - 1].child_anchor
-            own, other = (
-                [anchor(point, np.array(length), np.array(radius), axis) for point in (joint, at)]
+            on_human, on_figure = (
+                [anchor(point, np.array(length), np.array(radius), axis) for point in (joint, anchor_point)]
                 for length, radius in (human.sizes[link, :2], sizes[link])
             )
-            local.append(own[0] + other[1] - other[0])  # as far from its joint as on the figure
+            local.append(on_human[0] + on_figure[1] - on_figure[0])  # as far from its joint as on the figure
         self.local = np.array(local)
         self.torso = figure.torso
-        self.ahead = proportions[-1] * sizes[figure.torso, 0] * np.array(["shoulder" in name for name in POINTS], float)
+        self.shoulder_shift = (
+            proportions[-1] * sizes[figure.torso, 0] * np.array(["shoulder" in name for name in POINTS], float)
+        )
 
     def points(self, states: Any) -> Any:
         """Return the points (*, P, 3) [m] of states (*, L, 13)."""
-        turned = matrix(packed.orientation(states))
-        found = packed.position(states)[..., self.links, :]
-        found = found + jnp.einsum(
-            "...pij,pj->...pi", turned[..., self.links, :, :], jnp.asarray(self.local, states.dtype)
+        rotations = matrix(packed.orientation(states))
+        points = packed.position(states)[..., self.links, :]
+        points = points + jnp.einsum(
+            "...pij,pj->...pi", rotations[..., self.links, :, :], jnp.asarray(self.local, states.dtype)
         )
-        return found + jnp.asarray(self.ahead, states.dtype)[:, None] * turned[..., self.torso, None, :, 0]
+        return points + jnp.asarray(self.shoulder_shift, states.dtype)[:, None] * rotations[..., self.torso, None, :, 0]
 
 
-def terms_of(seen: Seen, camera: Camera, sigma: float, dt: float) -> tuple[CostTerm, ...]:
+def terms_of(body_points: BodyPoints, camera: Camera, sigma: float, dt: float) -> tuple[CostTerm, ...]:
     """Return the named cost terms of a candidate."""
     feet = np.array(FEET)
 
-    def image(states: Array, controls: Array, context: WantedMotion) -> Array:
-        apart = (camera.project(seen.points(states)) - context.places) / sigma
-        return (jnp.sqrt(context.weights)[..., None] * jnp.clip(apart, -30.0, 30.0)).reshape(len(states), -1)
+    def image(states: Array, controls: Array, context: FilmedMotion) -> Array:
+        distances = (camera.project(body_points.points(states)) - context.places) / sigma
+        return (jnp.sqrt(context.weights)[..., None] * jnp.clip(distances, -30.0, 30.0)).reshape(len(states), -1)
 
-    def near(states: Array, controls: Array, context: WantedMotion) -> Array:
-        return ((packed.position(states) - context.states[..., packed.POSITION]) / NEAR).reshape(len(states), -1)
+    def near(states: Array, controls: Array, context: FilmedMotion) -> Array:
+        return ((packed.position(states) - context.states[..., packed.POSITION]) / POSITION_SCALE).reshape(
+            len(states), -1
+        )
 
-    def pace(states: Array, controls: Array, context: WantedMotion) -> Array:
-        return ((packed.velocity(states) - context.states[..., packed.VELOCITY]) / PACE).reshape(len(states), -1)
+    def pace(states: Array, controls: Array, context: FilmedMotion) -> Array:
+        return ((packed.velocity(states) - context.states[..., packed.VELOCITY]) / VELOCITY_SCALE).reshape(
+            len(states), -1
+        )
 
-    def slip(states: Array, controls: Array, context: WantedMotion) -> Array:
-        points = seen.points(states)[:, feet]
-        moved = (points[1:] - points[:-1]) / (dt * STILL)
-        return (context.stands[1:, :, None] * moved).reshape(len(moved), -1)
+    def slip(states: Array, controls: Array, context: FilmedMotion) -> Array:
+        points = body_points.points(states)[:, feet]
+        scaled_velocity = (points[1:] - points[:-1]) / (dt * FOOT_SPEED_SCALE)
+        return (context.standing[1:, :, None] * scaled_velocity).reshape(len(scaled_velocity), -1)
 
-    def effort(states: Array, controls: Array, context: WantedMotion) -> Array:
+    def effort(states: Array, controls: Array, context: FilmedMotion) -> Array:
         return (controls - context.targets).reshape(len(controls), -1)
 
-    def smooth(states: Array, controls: Array, context: WantedMotion) -> Array:
+    def smooth(states: Array, controls: Array, context: FilmedMotion) -> Array:
         second = controls[2:] - 2.0 * controls[1:-1] + controls[:-2]
         return (second / 0.02).reshape(len(second), -1)
 
@@ -181,7 +189,7 @@ def terms_of(seen: Seen, camera: Camera, sigma: float, dt: float) -> tuple[CostT
 
 
 def planner_of(
-    scene: Scene, seen: Seen, camera: Camera, sigma: float, dynamics: Dynamics, preset: FitPreset,
+    scene: Scene, body_points: BodyPoints, camera: Camera, sigma: float, dynamics: Dynamics, preset: FitPreset,
     truth: Dynamics | None = None,
 ) -> Planner:  # fmt: skip
     """Return a planner with the costs of `terms_of`.
@@ -189,34 +197,36 @@ def planner_of(
     sigma: standard deviation of the keypoints [px]. truth: see `FitPreset.optimizers`.
     """
     return Planner(
-        dynamics, terms_of(seen, camera, sigma, scene.dt), preset.horizon, preset.knots, scene.dt,
-        SEARCH * exploration_std(scene), preset.optimizers(truth), *scene.limits,
+        dynamics, terms_of(body_points, camera, sigma, scene.dt), preset.horizon, preset.knots, scene.dt,
+        SPREAD_SHARE * exploration_std(scene), preset.optimizers(truth), *scene.limits,
     )  # fmt: skip
 
 
-def started(scene: Scene, wanted: WantedMotion) -> np.ndarray:
+def initial_state(scene: Scene, filmed: FilmedMotion) -> np.ndarray:
     """Return the initial state (L, 13) of the execution: the kinematic start's, raised out of the ground if needed."""
-    human, state = scene.bodies[0], wanted.states[0].copy()
-    sunk = clearance(human, state[None], human.sizes[None])[0]
-    state[:, 2] -= min(sunk, 0.0)
+    human, state = scene.bodies[0], filmed.states[0].copy()
+    height = clearance(human, state[None], human.sizes[None])[0]
+    state[:, 2] -= min(height, 0.0)
     return state
 
 
 def fit(
-    scene: Scene, planner: Planner, wanted: WantedMotion, state: np.ndarray, interval: int, seed: int = 0,
+    scene: Scene, planner: Planner, filmed: FilmedMotion, state: np.ndarray, interval: int, seed: int = 0,
     observe: Callable[[Execution], None] = lambda execution: None, checkpoint: Checkpoint | None = None,
 ) -> Execution:  # fmt: skip
-    """Plan and execute the whole wanted motion in the ground truth, from a state (L, 13); see `mpc.loop.execute`.
+    """Plan and execute the whole filmed motion in the ground truth, from a state (L, 13); see `mpc.loop.execute`.
 
     interval: steps between plans.
     """
-    steps, horizon = len(wanted.states) - 1, planner.horizon
+    steps, horizon = len(filmed.states) - 1, planner.horizon
 
     def window(step: int) -> Window:
-        after = np.minimum(step + 1 + np.arange(horizon), steps)
-        now = np.minimum(step + np.arange(horizon), steps)
-        context = WantedMotion(*(each[after] for each in wanted))._replace(targets=wanted.targets[now])
-        return Window(step * scene.dt, wanted.targets[now], context)
+        next_steps = np.minimum(step + 1 + np.arange(horizon), steps)
+        steps_of_plan = np.minimum(step + np.arange(horizon), steps)
+        context = FilmedMotion(*(values[next_steps] for values in filmed))._replace(
+            targets=filmed.targets[steps_of_plan]
+        )
+        return Window(step * scene.dt, filmed.targets[steps_of_plan], context)
 
     phase = Phase(planner, planner, interval, window)
     return execute(Truth(scene, 1), state, [phase], steps, jax.random.key(seed), observe, checkpoint=checkpoint)

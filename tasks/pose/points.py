@@ -50,7 +50,7 @@ class Keypoints:
         return len(self.places)
 
     @property
-    def seen(self) -> np.ndarray:
+    def detected(self) -> np.ndarray:
         """Return a mask (T, P) of the points that were detected."""
         return self.confidence > 0.0
 
@@ -67,7 +67,7 @@ class Keypoints:
 
 def interpolated(values: np.ndarray, rate: float, times: np.ndarray) -> np.ndarray:
     """Return values (T, ...) of a rate [1/s] interpolated linearly at times (N,) [s] from 0; the last one continues."""
-    at = np.minimum(times * rate, len(values) - 1)
-    before = at.astype(int)
-    share = (at - before).reshape(-1, *(1,) * (values.ndim - 1))
+    position = np.minimum(times * rate, len(values) - 1)
+    before = position.astype(int)
+    share = (position - before).reshape(-1, *(1,) * (values.ndim - 1))
     return (1.0 - share) * values[before] + share * values[np.minimum(before + 1, len(values) - 1)]

@@ -24,43 +24,43 @@ from mpc.loop import Checkpoint, Execution
 from tasks.models import ROWS, DynamicsName
 from tasks.pose import figure as figures
 from tasks.pose import lift, physical
-from tasks.pose.checkpoint import Progress, Spent
+from tasks.pose.checkpoint import PlanningEffort, Progress
 from tasks.pose.points import Keypoints, interpolated
 from viewer import Overlay
 
 # Time step of states and controls [s], as every scene's by default.
 DT = 0.01
-# Keypoints are shown so far before the points they belong to [m], or these would hide them.
-BEFORE = 0.2
-# Progress is saved every so many seconds.
-OFTEN = 5.0
-# Frames that are needed.
-LEAST = 10
+# Keypoints are shown this far before the points they belong to [m], or these would hide them.
+OVERLAY_DISTANCE = 0.2
+# Time between saves of the progress [s].
+SAVE_INTERVAL = 5.0
+# Fewest frames that show a person.
+MIN_FRAMES = 10
 
 
-def shown(keypoints: Keypoints) -> tuple[int, int]:
+def frames_with_person(keypoints: Keypoints) -> tuple[int, int]:
     """Return the first and the last frame in which a person is seen; raises InputError if too few show one."""
     frames = np.flatnonzero((keypoints.confidence > 0.3).sum(axis=1) >= 6)
-    if len(frames) < LEAST:
-        raise InputError(f"keypoints show 6 or more points in {len(frames)} frames, but need {LEAST} such frames")
+    if len(frames) < MIN_FRAMES:
+        raise InputError(f"keypoints show 6 or more points in {len(frames)} frames, but need {MIN_FRAMES} such frames")
     return int(frames[0]), int(frames[-1])
 
 
 def cut(keypoints: Keypoints) -> Keypoints:
     """Return the keypoints from the first frame in which a person is seen to the last."""
-    return keypoints.cut(*shown(keypoints))
+    return keypoints.cut(*frames_with_person(keypoints))
 
 
 def angles_of(states: np.ndarray, body: Body, dt: float) -> dict[str, Any]:
     """Return states (T, L, 13) as arguments of `motions.angles.motion`, scaled to the default human of 1.75 m."""
-    smaller = standing_height(human()) / standing_height(body)
-    turned = [
+    height_ratio = standing_height(human()) / standing_height(body)
+    rotations = [
         Rotation.from_quat(states[:, row, packed.ORIENTATION], scalar_first=True) for row in range(len(body.links))
     ]
-    angles = [(turned[joint.parent].inv() * turned[child]).as_rotvec() for child, joint, _ in body.motors]
+    angles = [(rotations[joint.parent].inv() * rotations[child]).as_rotvec() for child, joint, _ in body.motors]
     return {
         "rate": 1.0 / dt,
-        "position": smaller * states[:, 0, packed.POSITION],
+        "position": height_ratio * states[:, 0, packed.POSITION],
         "orientation": states[:, 0, packed.ORIENTATION],
         "angles": np.stack(angles, axis=1),
         "joints": [body.links[child].name for child, _, _ in body.motors],
@@ -70,18 +70,18 @@ def angles_of(states: np.ndarray, body: Body, dt: float) -> dict[str, Any]:
 class Reconstruction(NamedTuple):
     """Reconstructed motion of a film, before physics and after.
 
-    lifted: see `lift.Lifted`. body: as it was simulated. start, found: points (T, P, 3) [m] in every frame, of the
-    kinematic start and of the executed motion. wanted: the kinematic start at every step. states: (N, L, 13), executed.
-    spent: the cost of planning.
+    lifted: see `lift.Lifted`. body: as it was simulated. start, executed: points (T, P, 3) [m] in every frame, of the
+    kinematic start and of the executed motion. filmed: the kinematic start at every step. states: (N, L, 13), executed.
+    effort: the cost of planning.
     """
 
     lifted: lift.Lifted
     body: Body
     start: np.ndarray
-    found: np.ndarray
-    wanted: physical.WantedMotion
+    executed: np.ndarray
+    filmed: physical.FilmedMotion
     states: np.ndarray
-    spent: Spent
+    effort: PlanningEffort
 
     @property
     def fell(self) -> bool:
@@ -96,15 +96,15 @@ def reconstruct(
     preset: physical.FitPreset = physical.PRESETS["balanced"],
     seed: int = 0,
     progress: Progress | None = None,
-    at: Callable[[int, int], None] = lambda step, steps: None,
+    on_step: Callable[[int, int], None] = lambda step, steps: None,
 ) -> Reconstruction:
     """Plan and execute the physical motion from the kinematic start, with LARP or MuJoCo as the planner's model.
 
-    preset: the cost of a plan. progress: to continue from, and to save progress in. at: called after every
+    preset: the cost of a plan. progress: to continue from, and to save progress in. on_step: called after every
     step, with the number of steps done and of all.
     """
     figure = figures.figure()
-    body = figure.of(lifted.proportions)
+    body = figure.body_of(lifted.proportions)
     scene = Scene((body,), dt=DT)
     model: Dynamics
     truth: Dynamics | None = None
@@ -112,41 +112,43 @@ def reconstruct(
         model = MujocoDynamics(Truth(scene, ROWS, SUBSTEPS))
     else:
         model, truth = Simulator.of_physics(scene), MujocoDynamics(Truth(scene, 1, SUBSTEPS))
-    wanted = physical.wanted_of(scene, figure, lifted, film)
-    points = physical.Seen(body, figure, lifted.proportions)
+    filmed = physical.filmed_motion(scene, figure, lifted, film)
+    body_points = physical.BodyPoints(body, figure, lifted.proportions)
     sigma = lift.noise(film, lifted.camera)
-    planner = physical.planner_of(scene, points, lifted.camera, sigma, model, preset, truth)
-    spent, counted, saved = Spent() if progress is None else progress.spent, 0, time.monotonic()
+    planner = physical.planner_of(scene, body_points, lifted.camera, sigma, model, preset, truth)
+    effort, plans_counted, save_time = PlanningEffort() if progress is None else progress.effort, 0, time.monotonic()
 
     def observe(execution: Execution) -> None:
-        nonlocal spent, counted, saved
-        for plan in execution.plans[counted:]:
-            spent = spent.and_by(plan.info)
-        counted = len(execution.plans)
-        if progress is not None and counted and time.monotonic() - saved > OFTEN:
-            progress.save(lifted, Checkpoint.of(execution), spent)
-            saved = time.monotonic()
-        at(len(execution.controls), len(wanted.states) - 1)
+        nonlocal effort, plans_counted, save_time
+        for plan in execution.plans[plans_counted:]:
+            effort = effort.plus(plan.info)
+        plans_counted = len(execution.plans)
+        if progress is not None and plans_counted and time.monotonic() - save_time > SAVE_INTERVAL:
+            progress.save(lifted, Checkpoint.of(execution), effort)
+            save_time = time.monotonic()
+        on_step(len(execution.controls), len(filmed.states) - 1)
 
-    checkpoint, state = None if progress is None else progress.checkpoint, physical.started(scene, wanted)
-    execution = physical.fit(scene, planner, wanted, state, preset.interval, seed, observe, checkpoint)
+    checkpoint, state = None if progress is None else progress.checkpoint, physical.initial_state(scene, filmed)
+    execution = physical.fit(scene, planner, filmed, state, preset.interval, seed, observe, checkpoint)
     states = np.stack(execution.states)
-    executed = np.asarray(points.points(states.astype(np.float32)), float)
-    found = interpolated(executed, 1.0 / scene.dt, film.times)
+    points_at_steps = np.asarray(body_points.points(states.astype(np.float32)), float)
+    executed = interpolated(points_at_steps, 1.0 / scene.dt, film.times)
     start = figure.all_points(lifted.pose, lifted.proportions)
-    return Reconstruction(lifted, body, start, found, wanted, states, spent)
+    return Reconstruction(lifted, body, start, executed, filmed, states, effort)
 
 
-def overlay_of(film: Keypoints, made: Reconstruction) -> Overlay:
+def overlay_of(film: Keypoints, result: Reconstruction) -> Overlay:
     """Return the motion under the keypoints, for a page."""
-    lens = made.lifted.camera
-    position, turn = np.asarray(lens.position, float), np.asarray(lens.turn, float)
-    depth = (made.found - position) @ turn[2]
-    places = np.where(film.seen[..., None], film.places, np.nan), lens.project(made.found)
-    seen, found = (position + (depth - BEFORE)[..., None] * lens.ray(each) for each in places)
-    ahead = position + float(np.median(depth)) * lens.ray(np.asarray(lens.centre, float))
+    camera = result.lifted.camera
+    position, turn = np.asarray(camera.position, float), np.asarray(camera.turn, float)
+    depth = (result.executed - position) @ turn[2]
+    places = np.where(film.detected[..., None], film.places, np.nan), camera.project(result.executed)
+    detected, executed = (
+        position + (depth - OVERLAY_DISTANCE)[..., None] * camera.ray(image_places) for image_places in places
+    )
+    target = position + float(np.median(depth)) * camera.ray(np.asarray(camera.centre, float))
     return Overlay(
-        Scene((made.body,), dt=DT), made.states, made.wanted.states, seen, found, film.rate, (position, ahead),
-        2.0 * float(np.arctan(np.asarray(lens.centre)[1] / lens.focal)),
-        summary=(f"{len(film)} frames, {len(film) / film.rate:.1f} s", "fell" if made.fell else "did not fall"),
+        Scene((result.body,), dt=DT), result.states, result.filmed.states, detected, executed, film.rate,
+        (position, target), 2.0 * float(np.arctan(np.asarray(camera.centre)[1] / camera.focal)),
+        summary=(f"{len(film)} frames, {len(film) / film.rate:.1f} s", "fell" if result.fell else "did not fall"),
     )  # fmt: skip

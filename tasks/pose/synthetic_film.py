@@ -7,16 +7,16 @@ from typing import NamedTuple
 import numpy as np
 
 from tasks.motions.skeleton import Motion
-from tasks.pose.camera import Camera, focal_length, looking
+from tasks.pose.camera import Camera, focal_length, looking_at
 from tasks.pose.metrics import pelvis
 from tasks.pose.points import POINTS, SIDES, Keypoints
 
 # A skeleton's names of the joints at which our points are.
-JOINTS = {
+JOINT_NAMES = {
     "shoulder": "Arm", "elbow": "ForeArm", "wrist": "Hand", "hip": "UpLeg", "knee": "Leg", "ankle": "Foot",
 }  # fmt: skip
 # Points that skeletons lack, in the rest pose ahead, aside and above a joint, in shares of the hips' height.
-BESIDE = {
+OFFSETS = {
     "nose": ("Head", (0.105, 0.0, 0.07)),
     "left_ear": ("Head", (0.02, 0.08, 0.08)),
     "right_ear": ("Head", (0.02, -0.08, 0.08)),
@@ -34,21 +34,21 @@ class Noise(NamedTuple):
     swapped: float = 0.01
 
 
-USUAL = Noise()
+USUAL_NOISE = Noise()
 
 
 def points_of(motion: Motion) -> np.ndarray:
     """Return `POINTS` (T, P, 3) [m] of a captured motion; those that its skeleton lacks move with the nearest joint."""
-    found, hips = [], motion.hip_height
+    points, hips = [], motion.hip_height
     for name in POINTS:
         side, _, limb = name.partition("_")
-        if limb in JOINTS:
-            found.append(motion.path(side.capitalize() + JOINTS[limb]))
+        if limb in JOINT_NAMES:
+            points.append(motion.path(side.capitalize() + JOINT_NAMES[limb]))
             continue
-        joint, offset = BESIDE[limb if side in SIDES and limb in BESIDE else name]
+        joint, offset = OFFSETS[limb if side in SIDES and limb in OFFSETS else name]
         joint = joint if joint == "Head" else side.capitalize() + joint
-        found.append(motion.path(joint) + motion.rotation(joint).apply(hips * np.array(offset)))
-    return np.stack(found, axis=1)
+        points.append(motion.path(joint) + motion.rotation(joint).apply(hips * np.array(offset)))
+    return np.stack(points, axis=1)
 
 
 def camera_around(random: np.random.Generator, points: np.ndarray) -> Camera:
@@ -56,28 +56,28 @@ def camera_around(random: np.random.Generator, points: np.ndarray) -> Camera:
     middle = 0.5 * (points.min(axis=(0, 1)) + points.max(axis=(0, 1)))
     angle, field_of_view = random.uniform(-np.pi, np.pi), random.uniform(40.0, 75.0)
     height, focal = random.uniform(0.6, 2.2), focal_length(field_of_view, SIZE[0])
-    aside = np.array([np.cos(angle), np.sin(angle), 0.0])
+    direction = np.array([np.cos(angle), np.sin(angle), 0.0])
     for distance in np.arange(2.5, 30.0, 0.25):
-        position = np.array([*(middle + distance * aside)[:2], height])
-        camera = looking(position, middle, focal, SIZE)
-        ahead = (points - position) @ camera.turn[2]
-        if ahead.min() > 1.0 and abs(camera.project(points) - camera.centre).max() < 0.46 * min(SIZE):
+        position = np.array([*(middle + distance * direction)[:2], height])
+        camera = looking_at(position, middle, focal, SIZE)
+        depth = (points - position) @ camera.turn[2]
+        if depth.min() > 1.0 and abs(camera.project(points) - camera.centre).max() < 0.46 * min(SIZE):
             break
     return camera
 
 
-def seen(
-    random: np.random.Generator, camera: Camera, points: np.ndarray, rate: float, noise: Noise = USUAL
+def detected(
+    random: np.random.Generator, camera: Camera, points: np.ndarray, rate: float, noise: Noise = USUAL_NOISE
 ) -> Keypoints:
     """Return the keypoints of a simulated detector for points (T, P, 3) [m]; rate: frames per second.
 
     Errors are partly independent between frames, partly correlated over some. Confidence falls with the error.
     """
     frames, count = points.shape[:2]
-    slow = np.array(
-        [np.convolve(each, np.ones(5) / np.sqrt(5.0), "same") for each in _normal(random, 2 * count, frames)]
+    correlated_noise = np.array(
+        [np.convolve(signal, np.ones(5) / np.sqrt(5.0), "same") for signal in _normal(random, 2 * count, frames)]
     )
-    error = 0.8 * random.standard_normal((frames, count, 2)) + 0.6 * slow.T.reshape(frames, count, 2)
+    error = 0.8 * random.standard_normal((frames, count, 2)) + 0.6 * correlated_noise.T.reshape(frames, count, 2)
     places = camera.project(points) + noise.pixels * error
     confidence = np.clip(0.95 - 0.12 * np.linalg.norm(error, axis=-1) + 0.05 * _normal(random, frames, count), 0.1, 1.0)
     for limbs in (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle", "heel", "toe")):
@@ -95,7 +95,7 @@ def seen(
 
 def panned(camera: Camera, points: np.ndarray) -> np.ndarray:
     """Return points (T, P, 3) [m] whose image is that of the given ones by a camera that pans after the pelvis."""
-    turns = [looking(camera.position, each[0], camera.focal, SIZE).turn for each in pelvis(points)]
+    turns = [looking_at(camera.position, target[0], camera.focal, SIZE).turn for target in pelvis(points)]
     return camera.position + np.einsum("ji,tjk,tpk->tpi", camera.turn, turns, points - camera.position)
 
 
