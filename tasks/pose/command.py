@@ -62,6 +62,18 @@ def lifted_of(
     return lifted
 
 
+def slip_of(film: Keypoints, lens: Camera, lifted: Lifted, teller: Teller) -> float:
+    """Return the slip of the kinematic start [m/s], and warn where it, or the fit, shows that the camera moves."""
+    if lifted.error > MAX_MEDIAN_ERROR * 2.0 * np.max(lens.centre):
+        teller(
+            f"half of the points are more than {lifted.error:.0f} px off: does the camera move, or is it another one?"
+        )
+    slip = metrics.slip(figures.figure().all_points(lifted.pose, lifted.proportions), film.rate)
+    if slip > MAX_SLIP:
+        teller(f"the feet slip, by {slip:.2f} m/s where they ought to stand: does the camera move, or the ground?")
+    return slip
+
+
 def summary_of(film: Keypoints, result: Reconstruction, slip: float) -> dict[str, Any]:
     """Return the figures of a reconstruction, entries of `summary.json`. slip: see `metrics.slip` [m/s]."""
     lifted, effort = result.lifted, result.effort
@@ -159,13 +171,7 @@ def main(
     inputs = fingerprint(film.places, film.confidence, film.rate, *camera_inputs, *other_inputs)
     progress = Progress(out / "unfinished.npz", inputs)
     lifted = lifted_of(film, lens, position_known, height, progress, teller)
-    if lifted.error > MAX_MEDIAN_ERROR * 2.0 * np.max(lens.centre):
-        teller(
-            f"half of the points are more than {lifted.error:.0f} px off: does the camera move, or is it another one?"
-        )
-    slip = metrics.slip(figures.figure().all_points(lifted.pose, lifted.proportions), film.rate)
-    if slip > MAX_SLIP:
-        teller(f"the feet slip, by {slip:.2f} m/s where they ought to stand: does the camera move, or the ground?")
+    slip = slip_of(film, lens, lifted, teller)
     with teller.bar("planning and executing") as on_step:
         result = reconstruct(film, lifted, dynamics, physical.PRESETS[preset], seed, progress, on_step)
     if result.fell:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import pickletools
 import re
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
@@ -35,9 +36,12 @@ _VALUES = {
     *("BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8"),
 }
 _CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
+_EMPTY: dict[str, Callable[[], Any]] = {"EMPTY_LIST": list, "EMPTY_DICT": dict}
+_COLLECTORS = {"MARK", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "APPEND", "APPENDS", "SETITEM", "SETITEMS"}
+_CONSTRUCTORS = {"GLOBAL", "STACK_GLOBAL", "REDUCE", "BUILD"}
 
 
-class _Name(str):
+class _AllowedName(str):
     """Value of `NAMES`, distinguished from text in the file by its type."""
 
 
@@ -52,95 +56,121 @@ def load(path: Path) -> Any:
     """Return the content of a pickle of protocol 2 to 5; InputError if it is damaged or holds anything else."""
     try:
         with warnings.catch_warnings(action="ignore"):  # of odd text in damaged files
-            return _followed(path.read_bytes())
+            return _interpreted(path.read_bytes())
     except (ValueError, TypeError, LookupError, OverflowError, MemoryError) as error:
         why = shorten(str(error), 120, placeholder=" ...")
         raise InputError(f"{path.name} is no whole pickle of plain arrays: {why}; nothing in it was run") from None
 
 
-def _followed(content: bytes) -> Any:
-    stack: list[Any] = []
-    before: list[list[Any]] = []  # what was on the stack at each mark
-    memo: dict[int, Any] = {}
-    given: Any
-    for step, given, _ in pickletools.genops(content):
-        top: list[Any] = []
-        if step.name in ("TUPLE", "APPENDS", "SETITEMS"):
-            top, stack = stack, before.pop()
-        match step.name:
-            case name if name in _VALUES:
-                stack.append(given)
-            case name if name in _CONSTANTS:
-                stack.append(_CONSTANTS[name])
-            case "EMPTY_LIST" | "EMPTY_DICT" as name:
-                stack.append([] if name == "EMPTY_LIST" else {})
+def _interpreted(content: bytes) -> Any:
+    """Return the value that a pickle builds."""
+    machine = _StackMachine()
+    for opcode, argument, _ in pickletools.genops(content):
+        machine.step(opcode.name, argument)
+    (value,) = machine.stack
+    return value
+
+
+class _StackMachine:
+    """State of a pickle's interpretation: the stack above the last mark, the stacks below each mark, and the memo."""
+
+    def __init__(self) -> None:
+        self.stack: list[Any] = []
+        self.below_marks: list[list[Any]] = []
+        self.memo: dict[int, Any] = {}
+
+    def step(self, name: str, argument: Any) -> None:
+        """Run one opcode; an InputError names one that is not accepted."""
+        if name in _VALUES:
+            self.stack.append(argument)
+        elif name in _CONSTANTS:
+            self.stack.append(_CONSTANTS[name])
+        elif name in _EMPTY:
+            self.stack.append(_EMPTY[name]())
+        elif name in _COLLECTORS:
+            self._collect(name)
+        elif name in ("BINPUT", "LONG_BINPUT", "MEMOIZE"):
+            self.memo[len(self.memo) if argument is None else argument] = self.stack[-1]
+        elif name in ("BINGET", "LONG_BINGET"):
+            self.stack.append(self.memo[argument])
+        elif name in _CONSTRUCTORS:
+            self._construct(name, argument)
+        elif name not in ("PROTO", "FRAME", "STOP"):
+            raise InputError(f"it has the step {name}")
+
+    def _collect(self, name: str) -> None:
+        """Run an opcode that puts items of the stack into a tuple, a list or a dict."""
+        match name:
             case "MARK":
-                before.append(stack)
-                stack = []
+                self.below_marks.append(self.stack)
+                self.stack = []
             case "TUPLE":
-                stack.append(tuple(top))
-            case "TUPLE1" | "TUPLE2" | "TUPLE3" as name:
-                count = int(name[-1])
-                stack[-count:] = [tuple(stack[-count:])]
-            case "APPEND" | "SETITEM" as name:
-                count = 1 if name == "APPEND" else 2
-                stack, top = stack[:-count], stack[-count:]
-                _fill(stack[-1], top)
+                items, self.stack = self.stack, self.below_marks.pop()
+                self.stack.append(tuple(items))
             case "APPENDS" | "SETITEMS":
-                _fill(stack[-1], top)
-            case "BINPUT" | "LONG_BINPUT" | "MEMOIZE":
-                memo[len(memo) if given is None else given] = stack[-1]
-            case "BINGET" | "LONG_BINGET":
-                stack.append(memo[given])
+                items, self.stack = self.stack, self.below_marks.pop()
+                _fill(self.stack[-1], items)
+            case "APPEND" | "SETITEM":
+                count = 1 if name == "APPEND" else 2
+                self.stack, items = self.stack[:-count], self.stack[-count:]
+                _fill(self.stack[-1], items)
+            case _:  # TUPLE1, TUPLE2, TUPLE3
+                count = int(name[-1])
+                self.stack[-count:] = [tuple(self.stack[-count:])]
+
+    def _construct(self, name: str, argument: Any) -> None:
+        """Run an opcode that names a function, calls it, or gives its result a state."""
+        match name:
             case "GLOBAL":
-                stack.append(_named(given))
+                self.stack.append(_allowed(argument))
             case "STACK_GLOBAL":
-                stack[-2:] = [_named(" ".join(stack[-2:]))]
+                self.stack[-2:] = [_allowed(" ".join(self.stack[-2:]))]
             case "REDUCE":
-                stack[-2:] = [_made(*stack[-2:])]
+                self.stack[-2:] = [_result(*self.stack[-2:])]
             case "BUILD":
-                unfinished, state = stack[-2:]
-                stack[-2:] = [_finished(unfinished, state)]
-                memo = {key: stack[-1] if held is unfinished else held for key, held in memo.items()}
-            case name if name not in ("PROTO", "FRAME", "STOP"):
-                raise InputError(f"it has the step {name}")
-    (found,) = stack
-    return found
+                unfinished, state = self.stack[-2:]
+                finished = _finished(unfinished, state)
+                self.stack[-2:] = [finished]
+                self.memo = {key: finished if value is unfinished else value for key, value in self.memo.items()}
 
 
-def _fill(held: Any, items: list[Any]) -> None:
-    if isinstance(held, list):
-        held.extend(items)
-    elif isinstance(held, dict) and all(type(key) in (str, int, bytes) for key in items[::2]):
-        held.update(zip(items[::2], items[1::2], strict=True))
+def _fill(container: Any, items: list[Any]) -> None:
+    """Add items to a list, or keys and values in turn to a dict."""
+    if isinstance(container, list):
+        container.extend(items)
+    elif isinstance(container, dict) and all(type(key) in (str, int, bytes) for key in items[::2]):
+        container.update(zip(items[::2], items[1::2], strict=True))
     else:
         raise InputError("it fills what is no list, and no dict by text or numbers")
 
 
-def _named(name: str) -> _Name:
+def _allowed(name: str) -> _AllowedName:
+    """Return the operation that stands for a function; InputError if it is not one of `NAMES`."""
     if name not in NAMES:
         raise InputError(f"it names {name.replace(' ', '.')!r}")
-    return _Name(NAMES[name])
+    return _AllowedName(NAMES[name])
 
 
-def _made(name: Any, arguments: Any) -> Any:
+def _result(name: Any, arguments: Any) -> Any:
+    """Return the result of an operation of `NAMES` with its arguments."""
     match name, arguments:
-        case _Name("empty"), (_Name("array"), _, _):
+        case _AllowedName("empty"), (_AllowedName("array"), _, _):
             return _Unfinished()
-        case _Name("type"), (str(code), _, _):
+        case _AllowedName("type"), (str(code), _, _):
             if not _TYPES.fullmatch(code):
                 raise InputError(f"it has an array of type {code!r}")
             return _Unfinished(np.dtype(code))
-        case _Name("bytes"), ():
+        case _AllowedName("bytes"), ():
             return b""
-        case _Name("bytes"), (str(text), "latin1"):
+        case _AllowedName("bytes"), (str(text), "latin1"):
             return text.encode("latin1")
-        case _Name("filled"), (raw, kind, shape, order):
+        case _AllowedName("filled"), (raw, kind, shape, order):
             return _array(raw, kind, shape, order)
     raise InputError("it makes something that is not known")
 
 
 def _finished(unfinished: Any, state: Any) -> Any:
+    """Return the array or type of arrays that a state completes."""
     match unfinished, state:
         case _Unfinished(kind=None), (_, shape, kind, by_column, raw):
             return _array(raw, kind, shape, "F" if by_column else "C")
@@ -150,6 +180,7 @@ def _finished(unfinished: Any, state: Any) -> Any:
 
 
 def _array(raw: Any, kind: Any, shape: Any, order: Any) -> np.ndarray:
+    """Return the array of a shape and type in these bytes; order: "C" or "F"."""
     if not isinstance(raw, bytes | bytearray) or not isinstance(kind, np.dtype):
         raise InputError("it has an array without bytes or type")
     array = np.ndarray(shape, kind, buffer=bytes(raw), order=order)
