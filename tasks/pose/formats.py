@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from textwrap import shorten
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -210,16 +210,16 @@ def _json_frames(content: object, size: tuple[float, float] | None) -> dict[int,
     raise InputError(f"is JSON of another kind; {_SUPPORTED}")
 
 
-def _alphapose_frames(entries: list) -> dict[int, list[_Detection]]:
+def _alphapose_frames(entries: list[Any]) -> dict[int, list[_Detection]]:
     if not all(isinstance(entry, dict) and "image_id" in entry for entry in entries):
         raise InputError("has an entry without image_id")
-    people: dict[object, list] = {}
+    people: dict[object, list[Any]] = {}
     for entry in entries:
         people.setdefault(str(entry["image_id"]), []).append(entry)
     return {number: _people(people[image]) for number, image in _by_number(people).items()}
 
 
-def _mmpose_frames(entries: list, names: tuple[str, ...] | None = None) -> dict[int, list[_Detection]]:
+def _mmpose_frames(entries: list[Any], names: tuple[str, ...] | None = None) -> dict[int, list[_Detection]]:
     if not all(isinstance(entry, dict) and {"frame_id", "instances"} <= entry.keys() for entry in entries):
         raise InputError("has an entry without frame_id and instances")
     numbers = _by_number(entry["frame_id"] for entry in entries)
@@ -317,7 +317,7 @@ def _shortened(value: object) -> str:
     return shorten(str(value), 60, placeholder=" ...") or "nothing"
 
 
-def _checked_list(value: object) -> list:
+def _checked_list(value: object) -> list[Any]:
     if not isinstance(value, list | None):
         raise InputError(f"has {_shortened(value)} where it needs a list")
     return value or []

@@ -25,7 +25,8 @@ STRIDE = 0.1
 
 def pelvis(points: np.ndarray) -> np.ndarray:
     """Return the midpoint of the hips (*, 1, 3) of points (*, P, 3)."""
-    return points[..., HIPS, :].mean(axis=-2, keepdims=True)
+    middle: np.ndarray = points[..., HIPS, :].mean(axis=-2, keepdims=True)
+    return middle
 
 
 def position_errors(estimated: np.ndarray, true: np.ndarray) -> dict[str, float]:
@@ -60,7 +61,8 @@ def procrustes(estimated: np.ndarray, true: np.ndarray) -> np.ndarray:
     rotation, _ = Rotation.align_vectors(true_joints - true_mean, estimated_joints - estimated_mean)
     rotated = rotation.apply(estimated_joints - estimated_mean)
     scale = np.sum(rotated * (true_joints - true_mean)) / np.sum(rotated**2)
-    return scale * rotation.apply(estimated - estimated_mean) + true_mean
+    aligned: np.ndarray = scale * rotation.apply(estimated - estimated_mean) + true_mean
+    return aligned
 
 
 def velocity_error(estimated: np.ndarray, true: np.ndarray, rate: float) -> float:

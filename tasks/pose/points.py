@@ -70,4 +70,5 @@ def interpolated(values: np.ndarray, rate: float, times: np.ndarray) -> np.ndarr
     position = np.minimum(times * rate, len(values) - 1)
     before = position.astype(int)
     share = (position - before).reshape(-1, *(1,) * (values.ndim - 1))
-    return (1.0 - share) * values[before] + share * values[np.minimum(before + 1, len(values) - 1)]
+    result: np.ndarray = (1.0 - share) * values[before] + share * values[np.minimum(before + 1, len(values) - 1)]
+    return result
