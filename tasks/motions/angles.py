@@ -109,35 +109,39 @@ def _link_rotations(body: Body, orientation: np.ndarray, angles: np.ndarray) -> 
 
 def _motion_of_links(body: Body, rate: float, position: np.ndarray, rotations: list[Rotation]) -> Motion:
     """Return the motion with joints at the human's, their frames parallel to the world's in a T-pose."""
+    joints = _child_joints(body)
+    positions, offsets = [position], [np.zeros(3)]
+    for joint in joints[1:]:
+        parent = joints[joint.parent]
+        positions.append(positions[joint.parent] + rotations[parent.link].apply(joint.offset))
+        offsets.append(parent.to_rest.apply(joint.offset))
+    orientations = [(rotations[joint.link] * joint.to_rest.inv()).as_quat(scalar_first=True) for joint in joints]
+    return Motion(
+        tuple(joint.name for joint in joints),
+        np.array([joint.parent for joint in joints]),
+        np.array(offsets),
+        rate,
+        np.stack(positions, axis=1),
+        np.stack(orientations, axis=1),
+    )
+
+
+def _child_joints(body: Body) -> list[_ChildJoint]:
+    """Return the joints of a captured motion on the links of our human, parents first."""
     to_t_pose = {  # rotation of hanging arms to a T-pose's
         side: Rotation.from_rotvec((0.5 * np.pi * (1.0 if side == "Left" else -1.0), 0.0, 0.0)) for side in SIDES
     }
     links = {link.name: row for row, link in enumerate(body.links)}
     unturned = Rotation.identity()
-    rows = [_ChildJoint("Hips", 0, -1, np.zeros(3), unturned)]
+    joints = [_ChildJoint("Hips", 0, -1, np.zeros(3), unturned)]
     row_of = {"Hips": 0}
 
     def add(name: str, link: int, parent: str, offset: np.ndarray, to_rest: Rotation) -> None:
-        row_of[name] = len(rows)
-        rows.append(_ChildJoint(name, link, row_of[parent], offset, to_rest))
+        row_of[name] = len(joints)
+        joints.append(_ChildJoint(name, link, row_of[parent], offset, to_rest))
 
-    def joint_offset(link: int) -> np.ndarray:
-        """Return the vector from the parent's joint to the link's own joint, in the parent link's frame."""
-        joint = body.joints[link - 1]
-        own_joint = (
-            _joint_anchor(body, body.joints[joint.parent - 1].child_anchor, joint.parent)
-            if joint.parent
-            else np.zeros(3)
-        )
-        return _joint_anchor(body, joint.parent_anchor, joint.parent) - own_joint
-
-    def end_offset(link: int, direction: np.ndarray) -> np.ndarray:
-        """Return the vector from the link's joint to one end of its axis, in the link's frame."""
-        length = body.links[link].length
-        return 0.5 * length * direction - _joint_anchor(body, body.joints[link - 1].child_anchor, link)
-
-    add("Spine", links["torso"], "Hips", joint_offset(links["torso"]), unturned)
-    add("Head", links["head"], "Spine", joint_offset(links["head"]), unturned)
+    add("Spine", links["torso"], "Hips", _joint_offset(body, links["torso"]), unturned)
+    add("Head", links["head"], "Spine", _joint_offset(body, links["head"]), unturned)
     for side in SIDES:
         parents = {
             "Arm": "Spine",
@@ -148,22 +152,26 @@ def _motion_of_links(body: Body, rate: float, position: np.ndarray, rotations: l
         }
         for segment, name in LIMBS.items():
             link, to_rest = links[f"{side.lower()}_{segment}"], to_t_pose[side] if "arm" in segment else unturned
-            add(side + name, link, parents[name], joint_offset(link), to_rest)
+            add(side + name, link, parents[name], _joint_offset(body, link), to_rest)
             if name == "ForeArm":
-                add(f"{side}Hand", link, side + name, end_offset(link, np.array([0.0, 0.0, -1.0])), to_rest)
+                add(f"{side}Hand", link, side + name, _end_offset(body, link, np.array([0.0, 0.0, -1.0])), to_rest)
             if name == "Foot":
-                add(f"{side}ToeBase", link, side + name, end_offset(link, np.array([1.0, 0.0, 0.0])), to_rest)
-    positions, offsets = [position], [np.zeros(3)]
-    for joint in rows[1:]:
-        parent = rows[joint.parent]
-        positions.append(positions[joint.parent] + rotations[parent.link].apply(joint.offset))
-        offsets.append(parent.to_rest.apply(joint.offset))
-    orientations = [(rotations[joint.link] * joint.to_rest.inv()).as_quat(scalar_first=True) for joint in rows]
-    return Motion(
-        tuple(joint.name for joint in rows),
-        np.array([joint.parent for joint in rows]),
-        np.array(offsets),
-        rate,
-        np.stack(positions, axis=1),
-        np.stack(orientations, axis=1),
-    )
+                add(f"{side}ToeBase", link, side + name, _end_offset(body, link, np.array([1.0, 0.0, 0.0])), to_rest)
+    return joints
+
+
+def _joint_offset(body: Body, link: int) -> np.ndarray:
+    """Return the vector from the parent's joint to the link's own joint, in the parent link's frame."""
+    joint = body.joints[link - 1]
+    parent_joint = np.zeros(3)
+    if joint.parent:
+        parent_joint = _joint_anchor(body, body.joints[joint.parent - 1].child_anchor, joint.parent)
+    offset: np.ndarray = _joint_anchor(body, joint.parent_anchor, joint.parent) - parent_joint
+    return offset
+
+
+def _end_offset(body: Body, link: int, direction: np.ndarray) -> np.ndarray:
+    """Return the vector from the link's joint to one end of its axis, in the link's frame."""
+    link_joint = _joint_anchor(body, body.joints[link - 1].child_anchor, link)
+    offset: np.ndarray = 0.5 * body.links[link].length * direction - link_joint
+    return offset

@@ -46,7 +46,8 @@ class KeyPoses:
         lower, upper = (
             np.array([getattr(motor, bound) for _, _, motor in body.motors]) for bound in ("lower", "upper")
         )
-        return np.clip(in_detail(body, controls), lower, upper)
+        targets: np.ndarray = np.clip(in_detail(body, controls), lower, upper)
+        return targets
 
 
 def load(path: Path = FILE) -> KeyPoses:

@@ -81,13 +81,11 @@ def standing_on_ground(
 
 def clearance(body: Body, states: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """Return the height (N,) [m] above the ground of a body's lowest link, in states (N, n, 13), sizes (N, n, 3)."""
-    return np.min(
-        [
-            states[:, row, 2] - resting_height(link, states[:, row], sizes[:, row])
-            for row, link in enumerate(body.links)
-        ],
-        axis=0,
-    )
+    heights = [
+        states[:, row, 2] - resting_height(link, states[:, row], sizes[:, row]) for row, link in enumerate(body.links)
+    ]
+    lowest: np.ndarray = np.min(heights, axis=0)
+    return lowest
 
 
 def resting_height(link: Link, states: np.ndarray, sizes: np.ndarray | None = None) -> np.ndarray:
@@ -97,7 +95,8 @@ def resting_height(link: Link, states: np.ndarray, sizes: np.ndarray | None = No
     """
     rotations = Rotation.from_quat(states[:, packed.ORIENTATION], scalar_first=True)
     length, radius = (link.length, link.radius) if sizes is None else (sizes[:, 0], sizes[:, 1])
-    return radius + 0.5 * length * np.abs(rotations.apply(link.axis)[:, 2])
+    height: np.ndarray = radius + 0.5 * length * np.abs(rotations.apply(link.axis)[:, 2])
+    return height
 
 
 def initial_states(scene: Scene, poses: Sequence[KeyPoses]) -> np.ndarray:
@@ -246,7 +245,8 @@ def with_angular_velocities(states: np.ndarray, dt: float) -> np.ndarray:
 def with_servo_lead(scene: Scene, angles: np.ndarray) -> np.ndarray:
     """Return joint targets (T, J, 3) [rad] that lead the angles by the servos' lag, damping / stiffness."""
     lag = np.array([motor.damping / motor.stiffness for motor in scene.motors])[:, None]
-    return angles + lag * np.gradient(angles, scene.dt, axis=0)
+    targets: np.ndarray = angles + lag * np.gradient(angles, scene.dt, axis=0)
+    return targets
 
 
 def _position_weights(scene: Scene, steps: int, strike: int) -> np.ndarray:

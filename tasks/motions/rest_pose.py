@@ -112,7 +112,8 @@ def hinge_axis(motion: Motion, side: str, part: str, arm: bool) -> np.ndarray:
 
 def mean_in_joint_frame(to_joint_frame: Rotation, vectors: np.ndarray) -> np.ndarray:
     """Return the mean (3,) in a joint's frame of world vectors (T, 3); to_joint_frame: T rotations from the world."""
-    return to_joint_frame.apply(vectors).mean(axis=0)
+    vector: np.ndarray = to_joint_frame.apply(vectors).mean(axis=0)
+    return vector
 
 
 def aligned(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray] | None = None) -> Rotation:

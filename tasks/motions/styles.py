@@ -60,7 +60,8 @@ def kicks(random: np.random.Generator, body: Body, first_steps: np.ndarray, step
         pace = random.uniform(0.75, 1.3)
         pose_times = np.minimum((first_step + pace * np.arange(steps)) * dt, times[-1])
         targets.append(PchipInterpolator(times, angles_of_variation)(pose_times))
-    return np.clip(np.array(targets), *body.limits)
+    within_limits: np.ndarray = np.clip(np.array(targets), *body.limits)
+    return within_limits
 
 
 def gaits(random: np.random.Generator, body: Body, count: int, steps: int, dt: float) -> np.ndarray:
@@ -124,4 +125,5 @@ def style_std(body: Body) -> np.ndarray:
     """Return the standard deviation (J, 3) [rad] by which angles differ from motion to motion."""
     lower, upper = body.limits
     exploration = [EXPLORATION_STD[segment_of(body.links[child].name)] for child, _, _ in body.motors]
-    return np.minimum(1.5 * np.array(exploration)[:, None], 0.2 * (upper - lower))
+    std: np.ndarray = np.minimum(1.5 * np.array(exploration)[:, None], 0.2 * (upper - lower))
+    return std

@@ -15,8 +15,8 @@ from jax import Array
 from larp_model import state as packed
 from larp_model.engines.mujoco import Truth
 from larp_model.scene import Scene
-from mpc import CEM, CostTerm, MujocoDynamics, Planner, quadratic
-from mpc.loop import Phase, Window, execute
+from mpc import CEM, CostTerm, MujocoDynamics, Planner, Window, quadratic
+from mpc.loop import Phase, execute
 
 HORIZON = 30
 KNOTS = 7

@@ -45,7 +45,8 @@ class Camera:
     def ray(self, places: np.ndarray) -> np.ndarray:
         """Return rays (*, 3) of places (*, 2) [px], in the world frame, each reaching one metre ahead of the camera."""
         ahead = np.ones((*places.shape[:-1], 1))
-        return np.concatenate([(places - self.centre) / self.focal, ahead], axis=-1) @ self.turn
+        rays: np.ndarray = np.concatenate([(places - self.centre) / self.focal, ahead], axis=-1) @ self.turn
+        return rays
 
 
 def looking_at(position: np.ndarray, target: np.ndarray, focal: float, size: tuple[float, float]) -> Camera:
@@ -135,7 +136,7 @@ def _focal_length(fields: dict[str, Any], file_name: str, width: float) -> float
     if "focal" not in fields:
         (angle,) = _numbers(fields, "field_of_view", 1) if "field_of_view" in fields else (FIELD_OF_VIEW,)
         return focal_length(angle, width)
-    (focal,) = _numbers(fields, "focal", 1)
+    focal: float = _numbers(fields, "focal", 1)[0]
     if not focal > 0.0:
         raise InputError(f"camera: focal is {focal:g}, but must be above 0")
     return focal

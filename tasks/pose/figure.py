@@ -103,7 +103,8 @@ class Figure:
         def anchor_offset(link: int, anchor: Vector) -> Array:
             axis = np.asarray(self.body.links[link].axis)
             axial = np.asarray(anchor) @ axis * axis
-            return rotations[link] @ (0.5 * sizes[link, 0] * axial + sizes[link, 1] * (np.asarray(anchor) - axial))
+            local: Array = 0.5 * sizes[link, 0] * axial + sizes[link, 1] * (np.asarray(anchor) - axial)
+            return rotations[link] @ local
 
         for child, joint in enumerate(self.body.joints, start=1):
             rotations.append(rotations[joint.parent] @ joint_rotations[child - 1])
@@ -118,7 +119,8 @@ class Figure:
     def all_points(self, pose: Pose, proportions: np.ndarray) -> np.ndarray:
         """Return the points (T, P, 3) [m] of all frames."""
         single_proportions = single(proportions)
-        return by_rows(lambda *pose_rows: _all_points(self, *pose_rows, single_proportions), *pose)
+        points: np.ndarray = by_rows(lambda *pose_rows: _all_points(self, *pose_rows, single_proportions), *pose)
+        return points
 
 
 @cache

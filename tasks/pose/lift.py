@@ -179,7 +179,8 @@ class _FilmFit:
 
             def misfit(rows: list[int], side_rows: list[int] = side_rows) -> np.ndarray:
                 distances = np.linalg.norm(fitted[:, side_rows] - places[:, rows], axis=-1) / self.sigma
-                return np.nansum(np.minimum(distances, 20.0) * confidence[:, rows], axis=1)
+                total: np.ndarray = np.nansum(np.minimum(distances, 20.0) * confidence[:, rows], axis=1)
+                return total
 
             is_swapped = misfit(side_rows) > 1.3 * misfit(other_rows) + 10.0
             places[:, side_rows] = np.where(is_swapped[:, None, None], places[:, other_rows], places[:, side_rows])
@@ -261,7 +262,8 @@ class _FilmFit:
         def residual(quantities: PoseQuantities) -> np.ndarray:
             centre = np.einsum("p,tpx->tx", mass, quantities.points[..., :2])
             pressure = (share[..., None] * quantities.points[1:-1, FEET, :2]).sum(axis=1)
-            return centre[1:-1] - pressure - factor * second_differences(centre)
+            imbalance: np.ndarray = centre[1:-1] - pressure - factor * second_differences(centre)
+            return imbalance
 
         by_point = of_points.reshape(len(of_points), len(POINTS), 3, -1)[:, :, :2]
         of_centre = np.einsum("p,tpxd->txd", mass, by_point)
@@ -325,7 +327,8 @@ def noise(keypoints: Keypoints, camera: Camera) -> float:
 
 def second_differences(values: np.ndarray) -> np.ndarray:
     """Return the second differences (T - 2, ...) of values (T, ...) along the frames."""
-    return values[2:] - 2.0 * values[1:-1] + values[:-2]
+    differences: np.ndarray = values[2:] - 2.0 * values[1:-1] + values[:-2]
+    return differences
 
 
 def _stepped(pose: Pose, change: np.ndarray) -> Pose:

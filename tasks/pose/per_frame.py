@@ -172,7 +172,10 @@ class PerFrameFit:
 def _interpolated_pose(frames: np.ndarray, changes: np.ndarray, turns: np.ndarray, count: int) -> Pose:
     """Return the pose in all `count` frames, interpolated between those in `frames`."""
     frame_positions = np.clip(np.arange(count), frames[0], frames[-1])
-    interpolate = lambda values: np.stack([np.interp(frame_positions, frames, column) for column in values.T], axis=1)  # noqa: E731
+
+    def interpolate(values: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(frame_positions, frames, column) for column in values.T], axis=1)
+
     solved_rotations = Rotation.from_matrix(turns)
     rotations = (
         Slerp(frames, solved_rotations)(frame_positions)

@@ -28,8 +28,8 @@ from larp_model import state as packed
 from larp_model.engines.mujoco import Truth, closed
 from larp_model.rotation import matrix
 from larp_model.scene import Body, Scene, anchor
-from mpc import CostTerm, Dynamics, GaussNewton, Optimizer, Planner, Verified, quadratic
-from mpc.loop import Checkpoint, Execution, Phase, Window, execute
+from mpc import CostTerm, Dynamics, GaussNewton, Optimizer, Planner, Verified, Window, quadratic
+from mpc.loop import Checkpoint, Execution, Phase, execute
 from tasks.exploration import exploration_std
 from tasks.motions.references import clearance, with_angular_velocities, with_servo_lead
 from tasks.pose.camera import Camera
@@ -169,7 +169,8 @@ def terms_of(body_points: BodyPoints, camera: Camera, sigma: float, dt: float) -
     def slip(states: Array, controls: Array, context: FilmedMotion) -> Array:
         points = body_points.points(states)[:, feet]
         scaled_velocity = (points[1:] - points[:-1]) / (dt * FOOT_SPEED_SCALE)
-        return (context.standing[1:, :, None] * scaled_velocity).reshape(len(scaled_velocity), -1)
+        residual: Array = (context.standing[1:, :, None] * scaled_velocity).reshape(len(scaled_velocity), -1)
+        return residual
 
     def effort(states: Array, controls: Array, context: FilmedMotion) -> Array:
         return (controls - context.targets).reshape(len(controls), -1)
@@ -204,7 +205,8 @@ def planner_of(
 
 def initial_state(scene: Scene, filmed: FilmedMotion) -> np.ndarray:
     """Return the initial state (L, 13) of the execution: the kinematic start's, raised out of the ground if needed."""
-    human, state = scene.bodies[0], filmed.states[0].copy()
+    human = scene.bodies[0]
+    state: np.ndarray = filmed.states[0].copy()
     height = clearance(human, state[None], human.sizes[None])[0]
     state[:, 2] -= min(height, 0.0)
     return state

@@ -94,9 +94,10 @@ def detected(
 
 
 def panned(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Return points (T, P, 3) [m] whose image is that of the given ones by a camera that pans after the pelvis."""
+    """Return points (T, P, 3) [m] whose image is that of `points` by a camera that pans after the pelvis."""
     turns = [looking_at(camera.position, target[0], camera.focal, SIZE).turn for target in pelvis(points)]
-    return camera.position + np.einsum("ji,tjk,tpk->tpi", camera.turn, turns, points - camera.position)
+    moved: np.ndarray = camera.position + np.einsum("ji,tjk,tpk->tpi", camera.turn, turns, points - camera.position)
+    return moved
 
 
 def _normal(random: np.random.Generator, *shape: int) -> np.ndarray:
