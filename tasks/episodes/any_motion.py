@@ -65,11 +65,11 @@ def states_in_motion(
     human, rows, count = scene.body("human"), scene.rows("human"), len(sizes)
     kick_count, gait_count = round(KICK_SHARE * count), round(GAIT_SHARE * count)
     first_steps = np.where(random.random(kick_count) < 0.4, 0, random.integers(0, LATEST_KICK_STEP, kick_count))
-    usual_human = bodies.human()
+    default_human = bodies.human()
     targets_by_style = (
-        styles.kicks(random, usual_human, first_steps, steps, scene.dt),
-        styles.gaits(random, usual_human, gait_count, steps, scene.dt),
-        styles.moves(random, usual_human, count - kick_count - gait_count, steps, scene.dt),
+        styles.kicks(random, default_human, first_steps, steps, scene.dt),
+        styles.gaits(random, default_human, gait_count, steps, scene.dt),
+        styles.moves(random, default_human, count - kick_count - gait_count, steps, scene.dt),
     )
     targets = np.clip(in_detail(human, np.concatenate(targets_by_style)), *human.limits)
     lean_factor = np.where(random.random((count, 1)) < 0.15, 4.0, 1.0)

@@ -22,7 +22,7 @@ from tasks.exploration import exploration_std, smooth_noise
 from tasks.motions.references import Reference, clearance, resting_height
 
 STEPS = 70
-# A link that weighs less [kg] is pushed less, in proportion: a thumb would spin like a top.
+# A link that weighs less [kg] is pushed less, in proportion: a thumb would rotate too fast.
 FULL_PUSH_MASS = 0.5
 
 

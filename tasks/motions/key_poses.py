@@ -37,8 +37,8 @@ class KeyPoses:
 
     def controls(self, body: Body, steps: int, dt: float) -> np.ndarray:
         """Return the body's joint targets (steps, J, 3) [rad], monotone between key poses, constant after the last."""
-        lean_human = human()
-        names = [lean_human.links[child].name for child, _, _ in lean_human.motors]
+        default_human = human()
+        names = [default_human.links[child].name for child, _, _ in default_human.motors]
         times = np.minimum(np.arange(steps) * dt, self.times[-1])
         controls = np.zeros((steps, len(names), 3))
         for (joint, axis), angles in self.angles.items():

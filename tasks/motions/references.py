@@ -120,7 +120,7 @@ def embedded(scene: Scene, steps: int = 300, poses: KeyPoses | None = None) -> R
     truth = Truth(scene)
     next_states, is_finite = truth.rollout(state[None], controls[None])
     if not is_finite[0]:
-        raise InputError("scene: its human cannot perform the embedded reference kick; the truth diverged")
+        raise InputError("scene: its human cannot perform the embedded reference kick; the ground truth diverged")
     states = np.concatenate([state[None], next_states[0]])
     moving = np.linalg.norm(states[:, -1, packed.VELOCITY], axis=-1) > 0.5
     if not moving.any():
@@ -173,7 +173,7 @@ def captured(
     states_after, targets_after = tracker.follow(states_before[touch_step], touch_step, last)
     states = np.concatenate([states_before[:touch_step], states_after])
     if not finite(states[None])[0]:
-        raise InputError(f"{path}: the truth diverges when the human performs this kick")
+        raise InputError(f"{path}: the ground truth diverges when the human performs this kick")
     moving = np.linalg.norm(states[:, -1, packed.VELOCITY], axis=-1) > 0.5
     if not moving.any():
         raise InputError(f"{path}: the human misses the ball when it performs this kick")
@@ -214,8 +214,8 @@ def _launched_along_x(states: np.ndarray, strike: int) -> np.ndarray:
 def _retargeted(scene: Scene, clip: Motion) -> tuple[np.ndarray, np.ndarray]:
     """Return the clip as states (T, L, 13) and joint targets (T, J, 3) [rad] of the human, the ball out of reach."""
     human, ball = scene.bodies[0], scene.bodies[-1]
-    orientations, usual_targets = skeleton.retarget(clip, bodies.human(), scene.dt)
-    targets = in_detail(human, usual_targets)
+    orientations, default_targets = skeleton.retarget(clip, bodies.human(), scene.dt)
+    targets = in_detail(human, default_targets)
     root = Rotation.from_quat(orientations, scalar_first=True)
     states = standing_on_ground(scene, targets, root)
     rows = scene.rows(human.name)

@@ -106,8 +106,8 @@ def foot_frame(motion: Motion, side: str, usual: Rotation) -> Rotation:
 def hinge_axis(motion: Motion, side: str, part: str, arm: bool) -> np.ndarray:
     """Return the axis (3,) of knee or elbow in the frame of a limb's joint; its length is the mean bend [rad]."""
     upper, lower = (bone(motion, side + name) for name in (("Arm", "ForeArm") if arm else ("UpLeg", "Leg")))
-    bent = np.cross(upper, lower) / (np.linalg.norm(upper, axis=-1) * np.linalg.norm(lower, axis=-1))[:, None]
-    return mean_in_joint_frame(motion.rotation(side + part).inv(), bent)
+    bend = np.cross(upper, lower) / (np.linalg.norm(upper, axis=-1) * np.linalg.norm(lower, axis=-1))[:, None]
+    return mean_in_joint_frame(motion.rotation(side + part).inv(), bend)
 
 
 def mean_in_joint_frame(to_joint_frame: Rotation, vectors: np.ndarray) -> np.ndarray:

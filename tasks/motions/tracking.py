@@ -1,7 +1,7 @@
 """Tracking of a motion by the servo-driven human in the ground truth, with planned joint targets.
 
     minimise over theta   mean_t sum_i w_i |x_i(t) - x_i^target(t)|^2    links are near their target positions
-    subject to            S_{t+1} = truth(S_t, Q_t),  Q = Q^target + spline(theta)
+    subject to            S_{t+1} = dynamics(S_t, Q_t),  Q = Q^target + spline(theta)
 
 Captured joint angles alone do not keep a free body up: its size and its ground are not the captured person's.
 """

@@ -22,19 +22,19 @@ class Banded:
         derivatives: (offset, values (F, K, D + S)) by frames f + offset and the shared unknowns, offsets rising.
         """
         frame_size, length = self.border.shape[1], len(residual)
-        for number, (offset, first) in enumerate(derivatives):
+        for last, (offset, first) in enumerate(derivatives):
             weighted = (weights[..., None] * first).swapaxes(1, 2)
             gradient = (weighted @ residual[..., None])[..., 0]
             self.gradient[0][offset : offset + length] += gradient[:, :frame_size]
             self.gradient[1][:] += gradient[:, frame_size:].sum(axis=0)
-            for other, second in derivatives[: number + 1]:
+            for earlier, second in derivatives[: last + 1]:
                 product = weighted @ second
                 shared_product = product[:, frame_size:, frame_size:].sum(axis=0)
-                self.blocks[offset - other, other : other + length] += product[:, :frame_size, :frame_size]
+                self.blocks[offset - earlier, earlier : earlier + length] += product[:, :frame_size, :frame_size]
                 self.border[offset : offset + length] += product[:, :frame_size, frame_size:]
                 self.corner += shared_product
-                if other < offset:
-                    self.border[other : other + length] += product[:, frame_size:, :frame_size].swapaxes(1, 2)
+                if earlier < offset:
+                    self.border[earlier : earlier + length] += product[:, frame_size:, :frame_size].swapaxes(1, 2)
                     self.corner += shared_product.T
 
     def add_prior(self, weights: np.ndarray, values: np.ndarray) -> None:

@@ -154,7 +154,7 @@ def main(
         out: folder for summary.json, pose.npz and pose.bvh (each a reference for tasks.kick), pose.png,
             and pose.html, a replay under the keypoints.
         quiet: print nothing.
-        json: print the summary as JSON, and on stderr what else is told.
+        json: print the summary as JSON, and all other messages on stderr.
     """
     if height is not None and not HEIGHTS[0] <= height <= HEIGHTS[1]:
         raise InputError(f"height is {height:g}, but must be from {HEIGHTS[0]:g} to {HEIGHTS[1]:g} m")

@@ -44,7 +44,7 @@ class Keypoints:
         if not ((self.confidence >= 0.0) & (self.confidence <= 1.0)).all():
             raise InputError("confidence holds numbers that are not from 0 to 1")
         if not np.isfinite(self.places[self.confidence > 0.0]).all():
-            raise InputError("places holds numbers that are not finite, of points that were found")
+            raise InputError("places holds numbers that are not finite, of points that were detected")
 
     def __len__(self) -> int:
         return len(self.places)
