@@ -14,9 +14,9 @@ from mpc.search import COLOUR, Problem, Search, best_first, coloured_noise
 class CEM:
     """Draw candidates from a normal distribution over the knots, refit it to the best of them, repeat.
 
-    Refinements: noise coloured along the knots, a shrinking population, a share of the elites tried again
-    (the best always is), momentum on the old distribution, the mean itself tried in the last round, a floor
-    on the spread. What comes out is the best candidate, not the mean.
+    Refinements: noise coloured along the knots, a shrinking population, a share of the elites as candidates again
+    (the best always), momentum on the old distribution, the mean itself as a candidate of the last round, a floor
+    on the spread. The result is the best candidate, not the mean.
     """
 
     differentiates: ClassVar[bool] = False
@@ -57,7 +57,7 @@ class CEM:
         return tuple(max(2 * self.elites, self.samples >> h) for h in halvings)
 
     @property
-    def kept(self) -> int:
+    def retained(self) -> int:
         """Return how many elites are candidates of the next round again."""
         return max(1, math.ceil(self.keep * self.elites))
 
@@ -72,15 +72,15 @@ class CEM:
         """Return candidates (N, K, J, 3) [rad]: elites, best first, then draws, in the last round the mean as well."""
         noise = coloured_noise(random, (size, *search.mean.shape), self.exponent)
         candidates = search.mean + search.spread * noise
-        candidates[: self.kept] = search.elites[: self.kept]
+        candidates[: self.retained] = search.elites[: self.retained]
         if last:
-            candidates[self.kept] = search.mean
+            candidates[self.retained] = search.mean
         return candidates
 
     def update(self, search: Search, candidates: np.ndarray, costs: np.ndarray) -> Search:
         """Refit the distribution to the best candidates that are finite; if none is, it and the elites stay.
 
-        Where more elites are kept than there are candidates, the last of them stay too.
+        Where a search has more elites than there are candidates, the last of them stay too.
         """
         elites, elite_costs = best_first(candidates, costs, len(search.elites))
         count = int(np.isfinite(elite_costs[: self.elites]).sum())

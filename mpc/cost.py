@@ -65,16 +65,16 @@ def residuals(
     corrections: Mapping[str, jax.Array] | None = None,
 ) -> dict[str, jax.Array]:
     """Return each term's residual of one candidate, (R,) or (T, R), plus the correction of its name, if any."""
-    found = {term.name: term.residual(states, controls, context) for term in terms}
-    for name, residual in found.items():
+    values = {term.name: term.residual(states, controls, context) for term in terms}
+    for name, residual in values.items():
         if residual.ndim not in (1, 2):
             raise InputError(f"residual of {name!r}: got shape {residual.shape}, needs (R,) or (T, R)")
-    return {name: residual + (corrections or {}).get(name, 0.0) for name, residual in found.items()}
+    return {name: residual + (corrections or {}).get(name, 0.0) for name, residual in values.items()}
 
 
-def weighed(
+def weighted_cost(
     terms: Sequence[CostTerm],
-    found: Mapping[str, jax.Array],
+    residual_values: Mapping[str, jax.Array],
     states: jax.Array,
     weights: Mapping[str, jax.Array | float] | None = None,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
@@ -84,7 +84,8 @@ def weighed(
     candidate is never chosen. The shares are reported as they are.
     """
     shares = {
-        term.name: (weights or {}).get(term.name, term.weight) * jnp.mean(term.norm(found[term.name])) for term in terms
+        term.name: (weights or {}).get(term.name, term.weight) * jnp.mean(term.norm(residual_values[term.name]))
+        for term in terms
     }
     total = jnp.sum(jnp.stack(list(shares.values())))
     finite = jnp.isfinite(total) & jnp.all(jnp.isfinite(states))
@@ -98,30 +99,30 @@ def evaluate(
     context: Any = None,
     weights: Mapping[str, jax.Array | float] | None = None,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Return the cost of one candidate, states (H', L, 13) under controls (H, J, 3), and the shares: see `weighed`."""
-    return weighed(terms, residuals(terms, states, controls, context), states, weights)
+    """Return `weighted_cost` of one candidate with states (H', L, 13) under controls (H, J, 3)."""
+    return weighted_cost(terms, residuals(terms, states, controls, context), states, weights)
 
 
 def curvatures(
     terms: Sequence[CostTerm],
-    found: Mapping[str, jax.Array],
+    residual_values: Mapping[str, jax.Array],
     weights: Mapping[str, jax.Array | float] | None = None,
 ) -> dict[str, jax.Array]:
     """Return c >= 0 for each residual r, of its shape: sum(c r^2) / 2 + constant touches the cost, with its slope.
 
     The weights of iteratively reweighted least squares (P. Holland and R. Welsch 1977): slope of the norm / r; where r
-    is nearly zero, that ratio a little beside it.
+    is nearly zero, that ratio at a small r.
     """
 
-    def of(term: CostTerm) -> jax.Array:
-        residual = found[term.name]
+    def curvature(term: CostTerm) -> jax.Array:
+        residual = residual_values[term.name]
         size = jnp.sqrt(jnp.mean(residual**2, axis=-1, keepdims=True))
         least = jnp.maximum(1e-3 * size, 1e-6)
-        beside = jnp.where(jnp.abs(residual) < least, least, residual)
-        slope = jax.grad(lambda r: (weights or {}).get(term.name, term.weight) * jnp.mean(term.norm(r)))(beside)
-        return jnp.maximum(slope / beside, 0.0)
+        nonzero = jnp.where(jnp.abs(residual) < least, least, residual)
+        slope = jax.grad(lambda r: (weights or {}).get(term.name, term.weight) * jnp.mean(term.norm(r)))(nonzero)
+        return jnp.maximum(slope / nonzero, 0.0)
 
-    return {term.name: of(term) for term in terms}
+    return {term.name: curvature(term) for term in terms}
 
 
 def nearest_on_path(path: Any, point: Any) -> tuple[Any, Any]:
@@ -135,10 +136,10 @@ def nearest_on_path(path: Any, point: Any) -> tuple[Any, Any]:
     xp = path.__array_namespace__()
     start, along = path[:-1], path[1:] - path[:-1]
     squared = xp.sum(along**2, axis=-1)
-    share = xp.sum((point - start) * along, axis=-1) / xp.where(squared > 0.0, squared, 1.0)
-    places = start + xp.clip(share, 0.0, 1.0)[:, None] * along
-    row = xp.argmin(xp.sum((places - point) ** 2, axis=-1))
-    return places[row], row
+    fraction = xp.sum((point - start) * along, axis=-1) / xp.where(squared > 0.0, squared, 1.0)
+    points = start + xp.clip(fraction, 0.0, 1.0)[:, None] * along
+    row = xp.argmin(xp.sum((points - point) ** 2, axis=-1))
+    return points[row], row
 
 
 def require_weight(name: str, weight: float) -> None:

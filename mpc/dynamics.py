@@ -29,7 +29,7 @@ class Dynamics(Protocol):
         """Return states (N, H', L, 13) after steps 1 to H' >= H, from state (N, L, 13), controls (N, H, J, 3) [rad].
 
         Pure, traceable by JAX, and every row independent of the others. A row that diverged holds NaN. steps (): only
-        so many of the H are wanted; the rest of them repeat the last. A planner that wants all does not pass it.
+        so many of the H are computed; the rest of them repeat the last. A planner that needs all does not pass it.
         """
 
 
@@ -68,13 +68,13 @@ class MujocoDynamics:
 
     def _simulate(self, state: jax.Array, controls: jax.Array, steps: jax.Array) -> np.ndarray:
         start, targets, size = np.asarray(state), np.asarray(controls), self.truth.batch
-        wanted = int(steps)
+        count = int(steps)
         result = np.empty((*targets.shape[:2], *start.shape[1:]), np.float32)
         for begin in range(0, len(start), size):
             rows = np.minimum(np.arange(begin, begin + size), len(start) - 1)
-            states, ok = self.truth.rollout(start[rows], targets[rows, :wanted])
-            result[rows, :wanted] = np.where(ok[:, None, None, None], states, np.nan)
-        result[:, wanted:] = result[:, wanted - 1 : wanted]
+            states, ok = self.truth.rollout(start[rows], targets[rows, :count])
+            result[rows, :count] = np.where(ok[:, None, None, None], states, np.nan)
+        result[:, count:] = result[:, count - 1 : count]
         return result
 
 
@@ -111,16 +111,16 @@ class Continued:
         """Return the states of `Dynamics.rollout`; H' = H + `self.steps`."""
         states = self.dynamics.rollout(state, controls, **({} if steps is None else {"steps": steps}))
         last = states[:, -1]
-        followed = self.tail.rollout(last[:, self.links], jnp.zeros((len(state), self.steps, 0, 3)))
+        tail_states = self.tail.rollout(last[:, self.links], jnp.zeros((len(state), self.steps, 0, 3)))
         frozen = jnp.repeat(last[:, None], self.steps, axis=1)
-        return jnp.concatenate([states, frozen.at[:, :, self.links].set(followed)], axis=1)
+        return jnp.concatenate([states, frozen.at[:, :, self.links].set(tail_states)], axis=1)
 
     def tree_flatten(self) -> tuple[tuple[Dynamics, Dynamics], tuple[int, int, int]]:
         """Return the models, and the static fields that need a program of their own."""
         return (self.dynamics, self.tail), (self.links.start, self.links.stop, self.steps)
 
     @classmethod
-    def tree_unflatten(cls, rest: tuple[int, int, int], models: tuple[Dynamics, Dynamics]) -> Continued:
-        """Return the dynamics again; in JAX's hands the models may be placeholders."""
-        begin, end, steps = rest
+    def tree_unflatten(cls, fields: tuple[int, int, int], models: tuple[Dynamics, Dynamics]) -> Continued:
+        """Return the dynamics of flattened ones; inside JAX the models may be placeholders."""
+        begin, end, steps = fields
         return cls(*models, slice(begin, end), steps)

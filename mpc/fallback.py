@@ -25,27 +25,27 @@ class Fallback:
         require_tolerance(self.tolerance)
         if not (self.tolerance and self.optimizers):
             raise InputError(f"tolerance, optimizers: got {self.tolerance}, {self.optimizers}, needs some of both")
-        for each in self.optimizers:
-            if each.terminal:
-                raise InputError(f"optimizers: got {type(each).__name__}, which must come last of all")
+        for optimizer in self.optimizers:
+            if optimizer.terminal:
+                raise InputError(f"optimizers: got {type(optimizer).__name__}, which must come last of all")
 
     terminal: ClassVar[bool] = False
 
     @property
     def differentiates(self) -> bool:
         """Return whether any of its optimisers needs gradients."""
-        return any(each.differentiates for each in self.optimizers)
+        return any(optimizer.differentiates for optimizer in self.optimizers)
 
     @property
     def elites(self) -> int:
         """Return the largest number that any of its optimisers needs."""
-        return max(each.elites for each in self.optimizers)
+        return max(optimizer.elites for optimizer in self.optimizers)
 
     def improve(self, search: Search, random: np.random.Generator, problem: Problem) -> Search:
         """Return the search as it is, or after all rounds of all optimisers."""
         best = problem.evaluate(search.elites[:1])
         if converged(self.tolerance, float(best.costs[0]), best.residuals):
             return search
-        for each in self.optimizers:
-            search = each.improve(search, random, problem)
+        for optimizer in self.optimizers:
+            search = optimizer.improve(search, random, problem)
         return search

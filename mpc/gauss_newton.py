@@ -9,7 +9,7 @@ import numpy as np
 from larp_model.errors import InputError
 from mpc.search import COLOUR, Evaluations, Problem, Residuals, Search, coloured_noise, merged
 
-# Dampings of a round, tried side by side, as multiples of the last one that served best; it is expected to do so again.
+# Dampings of a round, evaluated side by side, as multiples of the last best one, which is expected to be best again.
 FACTORS = np.array([1e-2, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0, 1000.0])
 EXPECTED = 3
 # A step that gains more, or less, of what its quadratic promises divides, or multiplies, the next damping, down to a
@@ -23,9 +23,9 @@ class Linearization(NamedTuple):
     """Residuals around knots, taken as linear along directions from them."""
 
     knots: np.ndarray  # (K, J, 3)
-    here: Evaluations  # what they came to, N = 1
+    results: Evaluations  # of the knots, N = 1
     directions: np.ndarray  # (D, K, J, 3)
-    there: Evaluations  # what their neighbours came to, N = D, or none where derivatives are not differences
+    neighbour_results: Evaluations  # of their neighbours, N = D, or none where derivatives are not differences
 
 
 class Quadratic(NamedTuple):
@@ -49,9 +49,9 @@ class GaussNewton:
 
         minimise over a   sum_i weight_i (r_i + J_i a)^2 / 2 + damping |a|^2 / 2,   J = dr/dtheta B
 
-    `FACTORS` dampings are solved for and tried side by side, and the cheapest wins if it is cheaper than where it came
-    from. J comes from forward derivatives of the rollout (`forward`), or from differences of `step` spreads, which any
-    dynamics have and which see the same candidates' programs (`differences`): R rounds try R + 1 batches.
+    `FACTORS` dampings are solved for and evaluated side by side, and the cheapest step is taken if it lowers the cost.
+    J comes from forward derivatives of the rollout (`forward`), or from differences of `step` spreads, which any
+    dynamics have and which see the same candidates' programs (`differences`): R rounds evaluate R + 1 batches.
     """
 
     terminal: ClassVar[bool] = False
@@ -90,58 +90,67 @@ class GaussNewton:
         return search
 
     def refine(self, knots: np.ndarray, search: Search, random: np.random.Generator, problem: Problem) -> Search:
-        """Return the search after all rounds from knots (K, J, 3) on; every step that was tried may become an elite.
+        """Return the search after all rounds from knots (K, J, 3) on; every evaluated step may become an elite.
 
-        The neighbours that a round takes differences to are tried with the steps of the round before, when none of them
-        has won yet: around the step that is expected to, or around where the steps came from if no step of the last
-        round was any good. The winner's residuals are then taken to fall as those there do.
+        The neighbours that a round takes differences to are evaluated with the steps of the round before, when the best
+        of them is not known yet: around the step that is expected to be best, or around the knots that the steps start
+        from if the last round lowered no cost. The best step's residuals then get the derivatives found there.
         """
-        directions = self.drawn(search, random)
-        begun = np.concatenate([knots[None], self.neighbours(knots, directions)])
-        tried = problem.evaluate(begun)
-        search, here = merged(search, begun, tried.costs), tried.row(0)
-        if not np.isfinite(here.costs[0]):
-            return self.look_around(knots, search, random, problem)
-        linearization = Linearization(knots, here, directions, tried.rows(slice(1, None)))
-        damping, missed = self.damping, False
+        directions = self.draw_directions(search, random)
+        batch = np.concatenate([knots[None], self.neighbours(knots, directions)])
+        evaluations = problem.evaluate(batch)
+        search, results = merged(search, batch, evaluations.costs), evaluations.row(0)
+        if not np.isfinite(results.costs[0]):
+            return self.restart_nearby(knots, search, random, problem)
+        linearization = Linearization(knots, results, directions, evaluations.rows(slice(1, None)))
+        damping, failed = self.damping, False
         for number in range(self.rounds):
-            model = quadratic(here, self.derivatives(linearization, problem))
+            model = quadratic(results, self.derivatives(linearization, problem))
             steps, coordinates, dampings = self.steps(model, damping, linearization.directions, search.scale)
             if not len(steps):
                 break
-            directions = self.drawn(search, random)
-            ahead = knots if missed else knots + steps[EXPECTED]
-            neighbours = self.neighbours(ahead, directions)[: 0 if number + 1 == self.rounds else None]
-            together = np.concatenate([knots + steps, neighbours])
-            tried = problem.evaluate(together)
-            search, best = merged(search, together, tried.costs), int(np.argmin(tried.costs[: len(steps)]))
-            there, expected = tried.rows(slice(len(steps), None)), here if missed else tried.row(EXPECTED)
-            gained = float(here.costs[0] - tried.costs[best])
-            if (missed or gained > 0.0) and np.isfinite(expected.costs[0]):
-                linearization = Linearization(ahead, expected, directions, there)
-            missed = not gained > 0.0
-            if missed:
+            directions = self.draw_directions(search, random)
+            centre = knots if failed else knots + steps[EXPECTED]
+            neighbours = self.neighbours(centre, directions)[: 0 if number + 1 == self.rounds else None]
+            batch = np.concatenate([knots + steps, neighbours])
+            evaluations = problem.evaluate(batch)
+            search, cheapest = merged(search, batch, evaluations.costs), int(np.argmin(evaluations.costs[: len(steps)]))
+            neighbour_results, expected = (
+                evaluations.rows(slice(len(steps), None)),
+                results if failed else evaluations.row(EXPECTED),
+            )
+            gain = float(results.costs[0] - evaluations.costs[cheapest])
+            if (failed or gain > 0.0) and np.isfinite(expected.costs[0]):
+                linearization = Linearization(centre, expected, directions, neighbour_results)
+            failed = not gain > 0.0
+            if failed:
                 damping *= FAILED
             else:
-                knots, here = knots + steps[best], tried.row(best)
-                promised = model.gain(coordinates[best])
-                damping = dampings[best] * (CHANGE if gained < BAD * promised else 1.0)
-                damping = max(damping / CHANGE, FLOOR) if gained > GOOD * promised else damping
+                knots, results = knots + steps[cheapest], evaluations.row(cheapest)
+                predicted_gain = model.gain(coordinates[cheapest])
+                damping = dampings[cheapest] * (CHANGE if gain < BAD * predicted_gain else 1.0)
+                damping = max(damping / CHANGE, FLOOR) if gain > GOOD * predicted_gain else damping
             if self.differentiates:
-                linearization = Linearization(knots, here, directions, there)
+                linearization = Linearization(knots, results, directions, neighbour_results)
         return search
 
-    def look_around(self, knots: np.ndarray, search: Search, random: np.random.Generator, problem: Problem) -> Search:
-        """Refine the best candidate around knots whose own rollout is lost, so that nothing is linear there."""
-        for left in reversed(range(self.rounds)):
-            around = knots + self.drawn(search, random)
-            tried = problem.evaluate(around)
-            search, best = merged(search, around, tried.costs), int(np.argmin(tried.costs))
-            if np.isfinite(tried.costs[best]):
-                return replace(self, rounds=left).refine(around[best], search, random, problem) if left else search
+    def restart_nearby(
+        self, knots: np.ndarray, search: Search, random: np.random.Generator, problem: Problem
+    ) -> Search:
+        """Refine the best candidate drawn around knots whose own rollout is not finite, and so has no derivatives."""
+        for rounds_left in reversed(range(self.rounds)):
+            candidates = knots + self.draw_directions(search, random)
+            evaluations = problem.evaluate(candidates)
+            search, best = merged(search, candidates, evaluations.costs), int(np.argmin(evaluations.costs))
+            if np.isfinite(evaluations.costs[best]):
+                return (
+                    replace(self, rounds=rounds_left).refine(candidates[best], search, random, problem)
+                    if rounds_left
+                    else search
+                )
         return search
 
-    def drawn(self, search: Search, random: np.random.Generator) -> np.ndarray:
+    def draw_directions(self, search: Search, random: np.random.Generator) -> np.ndarray:
         """Return the directions (D, K, J, 3) [rad] of a round."""
         return search.spread * coloured_noise(random, (self.directions, *search.mean.shape), self.exponent)
 
@@ -153,42 +162,42 @@ class GaussNewton:
         """Return those of the residuals along the directions, (D, ...) by term; zero where they are not finite."""
         count = len(linearization.directions)
         if self.differentiates:
-            found, usable = problem.tangents(linearization.knots, linearization.directions), np.ones(count, bool)
+            slopes, usable = problem.tangents(linearization.knots, linearization.directions), np.ones(count, bool)
         else:
-            at, there = linearization.here.residuals, linearization.there
-            found = {name: (each - at[name]) / self.step for name, each in there.residuals.items()}
-            usable = np.isfinite(there.costs)  # the residuals of what is lost may be anything
-        usable &= np.all([np.isfinite(_flat(each)).all(axis=1) for each in found.values()], axis=0)
+            residuals, neighbours = linearization.results.residuals, linearization.neighbour_results
+            slopes = {name: (values - residuals[name]) / self.step for name, values in neighbours.residuals.items()}
+            usable = np.isfinite(neighbours.costs)  # the residuals of a diverged neighbour may be anything
+        usable &= np.all([np.isfinite(_flat(values)).all(axis=1) for values in slopes.values()], axis=0)
         if self.differentiates:
             problem.lost(int((~usable).sum()))
-        return {name: np.where(usable.reshape(-1, *(1,) * (r.ndim - 1)), r, 0.0) for name, r in found.items()}
+        return {name: np.where(usable.reshape(-1, *(1,) * (r.ndim - 1)), r, 0.0) for name, r in slopes.items()}
 
     def steps(
         self, model: Quadratic, damping: float, directions: np.ndarray, scale: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return steps (S, K, J, 3) [rad], coordinates (S, D) and dampings (S,); none where nothing has a slope."""
         mean = np.trace(model.curvature) / len(model.gradient)
-        none = directions[:0], np.zeros((0, len(directions))), np.zeros(0)
+        no_steps = directions[:0], np.zeros((0, len(directions))), np.zeros(0)
         if not (np.isfinite(model.gradient).all() and 0.0 < mean < np.inf):
-            return none
+            return no_steps
         dampings = damping * FACTORS
         # One decomposition serves all dampings.
         value, vector = np.linalg.eigh(model.curvature)
-        along = vector.T @ model.gradient
-        coordinates = -(along / (np.maximum(value, 0.0) + dampings[:, None] * mean)) @ vector.T
+        slopes = vector.T @ model.gradient
+        coordinates = -(slopes / (np.maximum(value, 0.0) + dampings[:, None] * mean)) @ vector.T
         steps = np.einsum("sd,dkjx->skjx", coordinates.astype(np.float32), directions)
         moving = scale > 0.0
         if not (moving.any() and np.any(steps)):
-            return none
+            return no_steps
         length = np.sqrt(np.mean((steps[..., moving] / scale[moving]) ** 2, axis=(1, 2)))
-        share = np.minimum(1.0, LONGEST / np.maximum(length, 1e-12))
-        return steps * share[:, None, None, None].astype(np.float32), coordinates * share[:, None], dampings
+        shortening = np.minimum(1.0, LONGEST / np.maximum(length, 1e-12))
+        return steps * shortening[:, None, None, None].astype(np.float32), coordinates * shortening[:, None], dampings
 
 
-def quadratic(here: Evaluations, derivatives: Residuals) -> Quadratic:
+def quadratic(results: Evaluations, derivatives: Residuals) -> Quadratic:
     """Return the quadratic around one candidate from its residuals (1, ...) and their derivatives (D, ...)."""
     slopes = [
-        (_flat(derivatives[name]).astype(float), _flat(here.residuals[name])[0], _flat(here.curvatures[name])[0])
+        (_flat(derivatives[name]).astype(float), _flat(results.residuals[name])[0], _flat(results.curvatures[name])[0])
         for name in derivatives
     ]
     return Quadratic(

@@ -17,14 +17,13 @@ DECAY, EPSILON = 0.9, 1e-8
 class Gradient:
     """RMSprop steps on the elites (Bharadhwaj et al. 2020, "CEM and gradient-based optimization").
 
-    Unlike there, every candidate is scored again after its steps, and the cheapest knots on its way are kept:
-    a step that lands badly costs time, never quality. Where a gradient is not finite its candidate stands
-    still.
+    Unlike there, every candidate is evaluated again after its steps, and its cheapest knots so far are the result:
+    a bad step costs time, never quality. Where a gradient is not finite its candidate stays.
 
-    The gradient of a long rollout through contact is true and still of little use: a learned ball on the ground turns a
-    height of 1 mm into 10 rad/s within a step, and such factors multiply. Of kicks drawn around the reference the
-    median is some 20 per spread, one in ten beyond 1e4, the largest seen 1e29. `clip` holds each knot's part:
-    the direction is kept, the size is not believed.
+    The gradient of a long rollout through contact is exact and still of little use: a learned ball on the ground turns
+    a height of 1 mm into 10 rad/s within a step, and such factors multiply. Of kicks drawn around the reference the
+    median is some 20 per spread, one in ten beyond 1e4, the largest observed 1e29. `clip` bounds each knot's part:
+    its direction stays, its size does not.
     """
 
     differentiates: ClassVar[bool] = True
@@ -47,20 +46,20 @@ class Gradient:
                 raise InputError(f"{name}: got {getattr(self, name)}, needs a finite number > 0")
 
     def improve(self, search: Search, _random: np.random.Generator, problem: Problem) -> Search:
-        """Return the search after all steps; every candidate is tried before each of them and after the last."""
+        """Return the search after all steps; every candidate is evaluated before each of them and after the last."""
         best = knots = self.sample(search)
-        best_costs, square = np.full(len(knots), np.inf, np.float32), np.zeros_like(knots)
+        best_costs, mean_square = np.full(len(knots), np.inf, np.float32), np.zeros_like(knots)
         for step in range(self.steps + 1):
             if step < self.steps:
                 costs, gradient = problem.gradients(knots)
             else:
                 costs = problem.evaluate(knots).costs
-            won = costs < best_costs
-            best = np.where(won[:, None, None, None], knots, best)
-            best_costs = np.where(won, costs, best_costs)
+            improved = costs < best_costs
+            best = np.where(improved[:, None, None, None], knots, best)
+            best_costs = np.where(improved, costs, best_costs)
             if step < self.steps:
-                change, square, lost = self.update(search.scale, gradient, square, step)
-                problem.lost(lost)
+                change, mean_square, lost_count = self.update(search.scale, gradient, mean_square, step)
+                problem.lost(lost_count)
                 knots = knots + change
         elites, elite_costs = best_first(
             np.concatenate([best, search.elites[len(best) :]]),
@@ -74,21 +73,21 @@ class Gradient:
         return search.elites[: self.elites]
 
     def update(
-        self, scale: np.ndarray, gradient: np.ndarray, square: np.ndarray, step: int
+        self, scale: np.ndarray, gradient: np.ndarray, mean_square: np.ndarray, step: int
     ) -> tuple[np.ndarray, np.ndarray, int]:
         """Return a step [rad] down the cost's gradient (N, K, J, 3) [1/rad], in units of the scale (J, 3) [rad].
 
         Also the running mean square, whose start is zero, and how many gradients were not finite.
         """
-        scaled, lost = self.clipped(gradient * scale)
-        square = DECAY * square + (1.0 - DECAY) * scaled**2
-        mean = square / (1.0 - DECAY ** (step + 1))
-        return -self.learning_rate * scaled / np.sqrt(mean + EPSILON) * scale, square, lost
+        scaled, lost_count = self.clipped(gradient * scale)
+        mean_square = DECAY * mean_square + (1.0 - DECAY) * scaled**2
+        unbiased = mean_square / (1.0 - DECAY ** (step + 1))
+        return -self.learning_rate * scaled / np.sqrt(unbiased + EPSILON) * scale, mean_square, lost_count
 
     def clipped(self, gradient: np.ndarray) -> tuple[np.ndarray, int]:
         """Return gradients (N, K, J, 3) [1/spread], each knot's at most `clip` long, and how many were not finite.
 
-        Those are zero: their candidates stand still.
+        Those are zero: their candidates do not move.
         """
         usable = np.isfinite(gradient).all(axis=(1, 2, 3))
         gradient = np.where(usable[:, None, None, None], gradient, 0.0)

@@ -101,42 +101,42 @@ def execute(
     """Plan, execute and replan for `steps`, from a state (L, 13) on, one phase after the other.
 
     After the last phase its plan is executed and, after the plan's end, the task's reference. observe: called after
-    every step. sense: returns the state that the planners are given of a true state (L, 13); the same by default.
+    every step. sense: returns the state that the planners get in a true state (L, 13); the same by default.
     checkpoint: to continue from; the plans in the result are then those from there on. Raises `DivergenceError` as soon
     as the world diverges.
     """
     execution = Execution([np.asarray(state)])
-    index, plan, planned_at, targets = 0, None, 0, np.zeros(0)
-    ends: int | None = None
+    phase_index, plan, plan_step, targets = 0, None, 0, np.zeros(0)
+    end_step: int | None = None
     if checkpoint is not None:
         execution = Execution([*checkpoint.states], [*checkpoint.controls])
-        plan, planned_at, index = checkpoint.plan, checkpoint.step, checkpoint.phase
-        targets = np.asarray(phases[index].replan.controls(plan, phases[index].window(planned_at).reference))
+        plan, plan_step, phase_index = checkpoint.plan, checkpoint.step, checkpoint.phase
+        targets = np.asarray(phases[phase_index].replan.controls(plan, phases[phase_index].window(plan_step).reference))
     world.reset(execution.states[-1][None])
     for step in range(len(execution.controls), steps):
-        current = sense(execution.states[-1])
-        while index < len(phases):
-            if ends is None and phases[index].is_done(step, current):
-                ends = step + phases[index].hold_steps
-            if ends is None or step < ends:
+        sensed = sense(execution.states[-1])
+        while phase_index < len(phases):
+            if end_step is None and phases[phase_index].is_done(step, sensed):
+                end_step = step + phases[phase_index].hold_steps
+            if end_step is None or step < end_step:
                 break
-            if phases[index + 1 :] and phases[index + 1].first is not phases[index].replan:
+            if phases[phase_index + 1 :] and phases[phase_index + 1].first is not phases[phase_index].replan:
                 plan = None
-            index, ends = index + 1, None
-        phase = phases[min(index, len(phases) - 1)]
-        if index < len(phases) and (plan is None or (ends is None and step - planned_at >= phase.interval)):
+            phase_index, end_step = phase_index + 1, None
+        phase = phases[min(phase_index, len(phases) - 1)]
+        if phase_index < len(phases) and (plan is None or (end_step is None and step - plan_step >= phase.interval)):
             planner, window = phase.first if plan is None else phase.replan, phase.window(step)
-            warm_start = planner.init(jax.random.fold_in(key, index), window.time) if plan is None else plan
-            plan, info = planner.step(warm_start, current[phase.links], window)
-            targets, planned_at = np.asarray(planner.controls(plan, window.reference)), step
-            execution.plans.append(PlanRecord(step, index, current, plan, info))
-        ahead = step - planned_at
-        control = targets[ahead] if ahead < len(targets) else np.asarray(phase.window(step).reference)[0]
+            warm_start = planner.init(jax.random.fold_in(key, phase_index), window.time) if plan is None else plan
+            plan, info = planner.step(warm_start, sensed[phase.links], window)
+            targets, plan_step = np.asarray(planner.controls(plan, window.reference)), step
+            execution.plans.append(PlanRecord(step, phase_index, sensed, plan, info))
+        offset = step - plan_step
+        control = targets[offset] if offset < len(targets) else np.asarray(phase.window(step).reference)[0]
         execution.controls.append(control)
-        after = world.step(control[None])[0]
-        if not np.isfinite(after).all():
+        next_state = world.step(control[None])[0]
+        if not np.isfinite(next_state).all():
             cause = "" if np.isfinite(control).all() else ": the joint targets are not finite"
             raise DivergenceError(f"the world diverged in step {step}{cause}")
-        execution.states.append(after)
+        execution.states.append(next_state)
         observe(execution)
     return execution

@@ -14,7 +14,7 @@ from mpc.search import COLOUR, Problem, Search, coloured_noise, merged
 class MPPI:
     """Draw candidates around the mean, move it to their average, each weighted by exp(-cost / temperature).
 
-    The spread stays as it is. The mean is a candidate in the next round, and what comes out is the best candidate.
+    The spread stays as it is. The mean is a candidate in the next round, and the result is the best candidate.
     """
 
     differentiates: ClassVar[bool] = False
@@ -28,7 +28,7 @@ class MPPI:
     exponent: float = COLOUR
     """Colour of the noise; 0 is white."""
     elites: int = 8
-    """Of the best candidates, so many are kept."""
+    """Number of the best candidates that the search returns."""
 
     def __post_init__(self) -> None:
         least_of = {"samples": 2, "rounds": 1, "elites": 1, "temperature": 1e-6, "exponent": 0}
@@ -37,7 +37,7 @@ class MPPI:
                 raise InputError(f"{name}: got {getattr(self, name)}, needs a finite number >= {least:g}")
 
     def improve(self, search: Search, random: np.random.Generator, problem: Problem) -> Search:
-        """Return the search after all rounds, with the last mean tried."""
+        """Return the search after all rounds, with the last mean evaluated."""
         search = search._replace(mean=search.elites[0])
         for _ in range(self.rounds):
             noise = coloured_noise(random, (self.samples, *search.mean.shape), self.exponent)
@@ -53,8 +53,8 @@ class MPPI:
         finite = np.isfinite(costs)
         if not finite.any():
             return search
-        value = costs[finite].astype(float)
-        unit = self.temperature * max(value.std(), 1e-12)
-        weight = np.exp((value.min() - value) / unit)
-        share = (weight / weight.sum()).astype(np.float32)
-        return search._replace(mean=np.einsum("n,nkjd->kjd", share, candidates[finite]))
+        finite_costs = costs[finite].astype(float)
+        scale = self.temperature * max(finite_costs.std(), 1e-12)
+        weights = np.exp((finite_costs.min() - finite_costs) / scale)
+        shares = (weights / weights.sum()).astype(np.float32)
+        return search._replace(mean=np.einsum("n,nkjd->kjd", shares, candidates[finite]))

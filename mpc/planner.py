@@ -51,13 +51,13 @@ class Plan(NamedTuple):
 
 
 class PlanInfo(NamedTuple):
-    """Figures of one planning step; for looking, never carried to the next."""
+    """Figures of one planning step; for display, never part of the next one."""
 
     cost: float  # of the plan; inf where no candidate was finite
     terms: dict[str, float]  # each term's weighted share of the cost
     states: np.ndarray  # (H', L, 13), what the dynamics predict for the plan
-    costs: list[np.ndarray]  # (N,) of all candidates, an array a round; inf: not finite, or lost for want of a gradient
-    elite_costs: np.ndarray  # (M,) of plan.elites; inf where not known
+    costs: list[np.ndarray]  # (N,) of all candidates, an array a round; inf: not finite, or without a finite gradient
+    elite_costs: np.ndarray  # (M,) of plan.elites; inf where not evaluated
     finite: int  # candidates with a finite cost ...
     candidates: int  # ... of so many
     verified: int  # of them in other dynamics than the planner's own
@@ -73,7 +73,7 @@ class Planner:
                               u_h = clip(reference_h + spline(theta, h dt), lower, upper)
 
     theta are `knots` offsets from the reference, evenly spaced from the first control to the last, so that
-    zero is the reference itself. The optimisers run in the order given, each on what the one before it found; the last
+    zero is the reference itself. The optimisers run in their order, each on the result of the one before it; the last
     one ranks the plan. The planner knows none of them: see `search.Optimizer`.
 
     `spread` (J, 3) [rad] is the standard deviation of a first plan's candidates; 0 locks an axis. A later
@@ -134,13 +134,13 @@ class Planner:
         )
         if not self.optimizers:
             raise InputError("optimizers: got none, needs at least one")
-        for each in self.optimizers:
-            if each.differentiates and not self.dynamics.differentiable:
-                names = type(each).__name__, type(self.dynamics).__name__
+        for optimizer in self.optimizers:
+            if optimizer.differentiates and not self.dynamics.differentiable:
+                names = type(optimizer).__name__, type(self.dynamics).__name__
                 raise InputError("optimizers: got {}, needs differentiable dynamics, not {}".format(*names))
-        for each in self.optimizers[:-1]:
-            if each.terminal:
-                raise InputError(f"optimizers: got {type(each).__name__} before another, needs it last")
+        for optimizer in self.optimizers[:-1]:
+            if optimizer.terminal:
+                raise InputError(f"optimizers: got {type(optimizer).__name__} before another, needs it last")
         self.elites = max(optimizer.elites for optimizer in self.optimizers)
 
     def init(self, key: jax.Array, now: float = 0.0) -> Plan:
@@ -158,30 +158,30 @@ class Planner:
         finite, that one is returned, at cost inf.
         """
         inputs = self._inputs(plan, state, window)
-        begin, compiled = time.perf_counter(), self._programs.seconds
+        begin, compiled_before = time.perf_counter(), self._programs.seconds
         random = np.random.default_rng(plan.key)
-        search = self._shifted(plan, window.time - float(plan.start), random)
+        search = self._warm_start(plan, window.time - float(plan.start), random)
         problem = PlannerProblem(self._equations, self._programs, inputs, search.elites[0])
         for optimizer in self.optimizers:
             search = optimizer.improve(search, random, problem)
             if len(search.elites) != self.elites:
                 name = type(optimizer).__name__
                 raise InputError(f"optimizers: got {len(search.elites)} elites from {name}, needs {self.elites}")
-        known = np.isfinite(search.costs)[:, None, None, None]
-        elites = np.where(known, search.elites, search.elites[0])
-        after = Plan(elites, search.spread, np.float32(window.time), _entropy(random))
-        states = problem.states_of(after.knots)
-        cost, terms = problem.judged(after.knots)
-        compile_seconds = self._programs.seconds - compiled
+        evaluated = np.isfinite(search.costs)[:, None, None, None]
+        elites = np.where(evaluated, search.elites, search.elites[0])
+        new_plan = Plan(elites, search.spread, np.float32(window.time), _entropy(random))
+        states = problem.states_of(new_plan.knots)
+        cost, terms = problem.plan_cost(new_plan.knots)
+        compile_seconds = self._programs.seconds - compiled_before
         record = problem.record
-        return after, PlanInfo(
+        return new_plan, PlanInfo(
             cost=cost,
             terms=terms,
             states=np.delete(states, np.s_[window.steps or self.horizon : self.horizon], axis=0),
             costs=record.costs,
             elite_costs=search.costs,
-            finite=sum(int(np.isfinite(each).sum()) for each in record.costs),
-            candidates=sum(len(each) for each in record.costs),
+            finite=sum(int(np.isfinite(costs).sum()) for costs in record.costs),
+            candidates=sum(len(costs) for costs in record.costs),
             verified=record.verified,
             seconds=time.perf_counter() - begin - compile_seconds,
             compile_seconds=compile_seconds,
@@ -200,7 +200,7 @@ class Planner:
         noise = coloured_noise(np.random.default_rng(0), (count, *plan.knots.shape), COLOUR)
         inputs = self._inputs(plan, state, window)
         problem = PlannerProblem(self._equations, self._programs, inputs, plan.knots)
-        return problem.shown(plan.knots + 0.5 * plan.spread * noise)
+        return problem.for_display(plan.knots + 0.5 * plan.spread * noise)
 
     def controls(self, plan: Plan, reference: ArrayLike) -> jax.Array:
         """Return joint targets (H, J, 3) [rad] of the plan, given the reference (H, J, 3) it was made around."""
@@ -211,16 +211,16 @@ class Planner:
         elites = jax.vmap(lambda knots: shift(knots, times, elapsed, self.interpolation))(elites)
         return elites, shift(spread, times, elapsed, "linear")  # a cubic could swing below zero
 
-    def _shifted(self, plan: Plan, elapsed: float, random: np.random.Generator) -> Search:
+    def _warm_start(self, plan: Plan, elapsed: float, random: np.random.Generator) -> Search:
         """Return the last plan's search shifted by `elapsed` [s], its spread widened, its costs unknown.
 
-        Where the last planner kept fewer elites, the others are drawn around its plan.
+        Where the last plan has fewer elites, the others are drawn around its best.
         """
         elites = plan.elites[: self.elites]
         missing = self.elites - len(elites)
         if missing:
-            drawn = plan.spread * coloured_noise(random, (missing, *plan.knots.shape), COLOUR)
-            elites = np.concatenate([elites, plan.knots + drawn])
+            samples = plan.spread * coloured_noise(random, (missing, *plan.knots.shape), COLOUR)
+            elites = np.concatenate([elites, plan.knots + samples])
         elites, spread = map(np.asarray, self._programs("shift", self._shift, elites, plan.spread, np.float32(elapsed)))
         spread = spread + self.reheat * np.maximum(self.scale - spread, 0.0)
         return Search(elites[0], spread, elites, np.full(self.elites, np.inf, np.float32), self.scale)
@@ -246,8 +246,8 @@ class Planner:
                 raise InputError(f"window.weights: got {name!r}, needs names of cost terms: {', '.join(weights)}")
             require_weight(name, weight)
             weights[name] = float(weight)
-        rest = jax.tree.map(_array, (window.context, weights, window.steps))
-        return Inputs(state, self._reference(window.reference), *rest)
+        arrays = jax.tree.map(_array, (window.context, weights, window.steps))
+        return Inputs(state, self._reference(window.reference), *arrays)
 
     def _reference(self, reference: ArrayLike) -> ArrayLike:
         shape = (self.horizon, *self.scale.shape)

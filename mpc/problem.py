@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpc.cost import CostTerm, curvatures, evaluate, residuals, weighed
+from mpc.cost import CostTerm, curvatures, evaluate, residuals, weighted_cost
 from mpc.dynamics import Dynamics, side_by_side
 from mpc.search import Evaluations, Residuals
 from mpc.spline import Interpolation, interpolate
@@ -29,7 +29,7 @@ class Inputs(NamedTuple):
     reference: Any  # (H, J, 3) rad
     context: Any
     weights: dict[str, Any]
-    steps: Any | None  # (), so many of the H suffice
+    steps: Any | None  # (), so many of the H are computed
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,36 +63,36 @@ class Equations:
     ) -> tuple[jax.Array, Any, Any]:
         """Return costs, residuals plus corrections, and their curvatures, of N candidates."""
 
-        def one(states: jax.Array, controls: jax.Array) -> tuple[jax.Array, Any, Any]:
-            found = residuals(self.terms, states, controls, inputs.context, corrections)
-            cost, _ = weighed(self.terms, found, states, inputs.weights)
-            return cost, found, curvatures(self.terms, found, inputs.weights)
+        def weigh_one(states: jax.Array, controls: jax.Array) -> tuple[jax.Array, Any, Any]:
+            residual_values = residuals(self.terms, states, controls, inputs.context, corrections)
+            cost, _ = weighted_cost(self.terms, residual_values, states, inputs.weights)
+            return cost, residual_values, curvatures(self.terms, residual_values, inputs.weights)
 
-        return jax.vmap(one)(states, controls)
+        return jax.vmap(weigh_one)(states, controls)
 
     def gradients(
         self, dynamics: Dynamics, inputs: Inputs, knots: jax.Array, corrections: Any
     ) -> tuple[jax.Array, Any, jax.Array]:
         """Return gradients (N, K, J, 3) of the costs of knots (N, K, J, 3), the result of `weigh`, and the states."""
 
-        def summed(knots: jax.Array) -> tuple[jax.Array, Any]:
+        def total_cost(knots: jax.Array) -> tuple[jax.Array, Any]:
             states, controls = self.roll_out(dynamics, inputs, knots)
-            tried = self.weigh(inputs, states, controls, corrections)
-            return jnp.sum(tried[0]), (tried, states)
+            results = self.weigh(inputs, states, controls, corrections)
+            return jnp.sum(results[0]), (results, states)
 
-        gradient, (tried, states) = jax.grad(summed, has_aux=True)(knots)
-        return gradient, tried, states
+        gradient, (results, states) = jax.grad(total_cost, has_aux=True)(knots)
+        return gradient, results, states
 
     def tangents(self, dynamics: Dynamics, inputs: Inputs, knots: jax.Array, directions: jax.Array) -> Any:
         """Return derivatives (D, ...) of the residuals at knots (K, J, 3) along directions (D, K, J, 3)."""
 
-        def found(knots: jax.Array) -> Any:
+        def residuals_of(knots: jax.Array) -> Any:
             states, controls = (leaf[0] for leaf in self.roll_out(dynamics, inputs, knots[None]))
             return residuals(self.terms, states, controls, inputs.context)
 
-        return jax.vmap(lambda direction: jax.jvp(found, (knots,), (direction,))[1])(directions)
+        return jax.vmap(lambda direction: jax.jvp(residuals_of, (knots,), (direction,))[1])(directions)
 
-    def judge(self, inputs: Inputs, knots: jax.Array, states: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def plan_cost(self, inputs: Inputs, knots: jax.Array, states: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Return the cost and each term's share of knots (K, J, 3) that led to states (H', L, 13)."""
         controls = self.controls(knots, inputs.reference)
         return evaluate(self.terms, states, controls, inputs.context, inputs.weights)
@@ -111,7 +111,7 @@ class Programs:
         return self.__dict__ | {"_compiled": {}, "_dynamics": []}
 
     def number(self, dynamics: Dynamics) -> int:
-        """Return the number of these dynamics among all that were asked for; they need not be hashable."""
+        """Return the number of these dynamics among all those numbered so far; they need not be hashable."""
         for number, other in enumerate(self._dynamics):
             if other is dynamics:
                 return number
@@ -131,7 +131,7 @@ class Programs:
 
 @dataclass
 class Record:
-    """A record of the candidates that were tried while one plan was made."""
+    """Record of the candidates that were evaluated while one plan was made."""
 
     costs: list[np.ndarray] = field(default_factory=list)
     verified: int = 0
@@ -148,13 +148,13 @@ class PlannerProblem:
     warm_start: np.ndarray
     corrections: Residuals = field(default_factory=dict)
     record: Record = field(default_factory=Record)
-    known: dict[bytes, Evaluations] = field(default_factory=dict)
+    cache: dict[bytes, Evaluations] = field(default_factory=dict)
     """Results of the best candidate of each batch, by its knots."""
 
     def evaluate(self, knots: np.ndarray) -> Evaluations:
         """See `search.Problem`."""
-        if len(knots) == 1 and (known := self.known.get(knots.tobytes())):
-            return known
+        if len(knots) == 1 and (cached := self.cache.get(knots.tobytes())):
+            return cached
         dynamics = self.equations.dynamics
         size = side_by_side(dynamics)
         few = len(knots) <= (max(FEW, size) if jax.default_backend() == "cpu" else size)
@@ -162,15 +162,15 @@ class PlannerProblem:
 
     def gradients(self, knots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """See `search.Problem`."""
-        function, arguments = called(self.equations.gradients, self.equations.dynamics)
-        gradient, tried, states = self.run("gradients", function, *arguments, self.inputs, knots, self.corrections)
-        return self._recorded(knots, tried, states).costs, np.asarray(gradient)
+        function, arguments = program_of(self.equations.gradients, self.equations.dynamics)
+        gradient, results, states = self.run("gradients", function, *arguments, self.inputs, knots, self.corrections)
+        return self._add_to_record(knots, results, states).costs, np.asarray(gradient)
 
     def tangents(self, knots: np.ndarray, directions: np.ndarray) -> Residuals:
         """See `search.Problem`."""
-        function, arguments = called(self.equations.tangents, self.equations.dynamics)
-        found = self.run("tangents", function, *arguments, self.inputs, knots, directions)
-        return {name: np.asarray(each) for name, each in found.items()}
+        function, arguments = program_of(self.equations.tangents, self.equations.dynamics)
+        derivatives = self.run("tangents", function, *arguments, self.inputs, knots, directions)
+        return {name: np.asarray(values) for name, values in derivatives.items()}
 
     def lost(self, count: int) -> None:
         """See `search.Problem`."""
@@ -180,12 +180,12 @@ class PlannerProblem:
     def validate(self, dynamics: Dynamics, knots: np.ndarray) -> Evaluations:
         """See `search.Problem`."""
         self.record.verified += len(knots)
-        apart = replace(self, corrections={}, record=Record(self.record.costs), known={})
-        return apart._evaluate(dynamics, knots, len(knots))
+        uncorrected = replace(self, corrections={}, record=Record(self.record.costs), cache={})
+        return uncorrected._evaluate(dynamics, knots, len(knots))
 
     def corrected(self, corrections: Residuals) -> PlannerProblem:
         """See `search.Problem`."""
-        return replace(self, corrections={name: each[0] for name, each in corrections.items()}, known={})
+        return replace(self, corrections={name: values[0] for name, values in corrections.items()}, cache={})
 
     def states_of(self, knots: np.ndarray) -> np.ndarray:
         """Return the states (H', L, 13) of knots (K, J, 3)."""
@@ -193,43 +193,43 @@ class PlannerProblem:
             self.evaluate(knots[None])
         return self.record.best[knots.tobytes()]
 
-    def shown(self, knots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return costs (N,) and states (N, H', L, 13) of knots (N, K, J, 3), for looking: they are not recorded."""
+    def for_display(self, knots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return costs (N,) and states (N, H', L, 13) of knots (N, K, J, 3), for display: they are not recorded."""
         dynamics = self.equations.dynamics
-        tried, states = self._rolled(dynamics, knots, side_by_side(dynamics))
-        return np.asarray(tried[0]), np.asarray(states)
+        results, states = self._roll_out(dynamics, knots, side_by_side(dynamics))
+        return np.asarray(results[0]), np.asarray(states)
 
-    def judged(self, knots: np.ndarray) -> tuple[float, dict[str, float]]:
+    def plan_cost(self, knots: np.ndarray) -> tuple[float, dict[str, float]]:
         """Return the cost of knots (K, J, 3) and each term's share of it."""
-        cost, terms = self.run("judge", self.equations.judge, self.inputs, knots, self.states_of(knots))
+        cost, terms = self.run("judge", self.equations.plan_cost, self.inputs, knots, self.states_of(knots))
         return float(cost), {name: float(value) for name, value in terms.items()}
 
     def _evaluate(self, dynamics: Dynamics, knots: np.ndarray, size: int) -> Evaluations:
-        return self._recorded(knots, *self._rolled(dynamics, knots, size))
+        return self._add_to_record(knots, *self._roll_out(dynamics, knots, size))
 
-    def _rolled(self, dynamics: Dynamics, knots: np.ndarray, size: int) -> tuple[Any, Any]:
+    def _roll_out(self, dynamics: Dynamics, knots: np.ndarray, size: int) -> tuple[Any, Any]:
         """Return the result of `weigh` for knots, and their states: `size` at a time, the last ones filled up."""
-        name, found = ("roll out", self.run.number(dynamics)), []
-        roll_out, arguments = called(self.equations.roll_out, dynamics)
+        name, batches = ("roll out", self.run.number(dynamics)), []
+        roll_out, arguments = program_of(self.equations.roll_out, dynamics)
         for begin in range(0, len(knots), size):
             rows = np.minimum(np.arange(begin, begin + size), len(knots) - 1)
             states, controls = self.run(name, roll_out, *arguments, self.inputs, knots[rows])
-            tried = self.run("weigh", self.equations.weigh, self.inputs, states, controls, self.corrections)
-            found.append((tried, states))
+            results = self.run("weigh", self.equations.weigh, self.inputs, states, controls, self.corrections)
+            batches.append((results, states))
         if len(knots) == size:
-            return found[0]
-        return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(knots)], *found)
+            return batches[0]
+        return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(knots)], *batches)
 
-    def _recorded(self, knots: np.ndarray, tried: Any, states: jax.Array) -> Evaluations:
-        found = Evaluations(*jax.tree.map(np.asarray, tried))
-        self.record.costs.append(found.costs)
-        best = int(np.argmin(found.costs))
+    def _add_to_record(self, knots: np.ndarray, results: Any, states: jax.Array) -> Evaluations:
+        evaluations = Evaluations(*jax.tree.map(np.asarray, results))
+        self.record.costs.append(evaluations.costs)
+        best = int(np.argmin(evaluations.costs))
         key = knots[best].tobytes()
-        self.record.best[key], self.known[key] = np.asarray(states)[best].copy(), found.row(best)
-        return found
+        self.record.best[key], self.cache[key] = np.asarray(states)[best].copy(), evaluations.row(best)
+        return evaluations
 
 
-def called(function: Callable[..., Any], dynamics: Dynamics) -> tuple[Callable[..., Any], tuple[Dynamics, ...]]:
+def program_of(function: Callable[..., Any], dynamics: Dynamics) -> tuple[Callable[..., Any], tuple[Dynamics, ...]]:
     """Return the function to compile of one whose first argument are dynamics, and its leading arguments.
 
     Dynamics that are a pytree of arrays are an argument: others of the same structure then need not be compiled again.

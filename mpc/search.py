@@ -22,7 +22,7 @@ class Search(NamedTuple):
 
     mean: np.ndarray  # (K, J, 3) rad, centre of the sampling distribution
     spread: np.ndarray  # (K, J, 3) rad, its standard deviation
-    elites: np.ndarray  # (M, K, J, 3) rad, the best candidates, best first; first of all, the plan carried on
+    elites: np.ndarray  # (M, K, J, 3) rad, the best candidates, best first; first of all, the warm start
     costs: np.ndarray  # (M,) of the elites, +inf while unknown
     scale: np.ndarray  # (J, 3) rad, the spread of a first plan: how far each joint is worth moving
 
@@ -44,7 +44,7 @@ class Evaluations(NamedTuple):
 
     def rows(self, which: slice) -> Evaluations:
         """Return some of the candidates."""
-        residuals, curvatures = ({name: each[which] for name, each in values.items()} for values in self[1:])
+        residuals, curvatures = ({name: leaf[which] for name, leaf in values.items()} for values in self[1:])
         return Evaluations(self.costs[which], residuals, curvatures)
 
     def row(self, index: int) -> Evaluations:
@@ -65,7 +65,7 @@ class Problem(Protocol):
         """Return derivatives of the residuals at knots (K, J, 3) along D directions (D, K, J, 3), (D, ...) by term."""
 
     def lost(self, count: int) -> None:
-        """Count candidates that could not be tried, because a gradient was not finite."""
+        """Count candidates that could not be evaluated, because a gradient was not finite."""
 
     @property
     def warm_start(self) -> np.ndarray:
@@ -110,8 +110,8 @@ def converged(tolerance: Tolerance, cost: float, residuals: Residuals) -> bool:
     for name, _ in tolerance:
         if name not in residuals:
             raise InputError(f"tolerance: got {name!r}, needs names of cost terms: {', '.join(residuals)}")
-    short = [np.linalg.norm(residuals[name]) <= length for name, length in tolerance]
-    return bool(short) and bool(np.isfinite(cost)) and all(short)
+    within = [np.linalg.norm(residuals[name]) <= length for name, length in tolerance]
+    return bool(within) and bool(np.isfinite(cost)) and all(within)
 
 
 def best_first(knots: np.ndarray, costs: np.ndarray, count: int | None) -> tuple[np.ndarray, np.ndarray]:
@@ -123,18 +123,20 @@ def best_first(knots: np.ndarray, costs: np.ndarray, count: int | None) -> tuple
 def distinct(knots: np.ndarray) -> np.ndarray:
     """Return the numbers (M,) of the knots (N, K, J, 3) that are not copies of an earlier one, in their order."""
     first: dict[bytes, int] = {}
-    for row, each in enumerate(knots):
-        first.setdefault(each.tobytes(), row)
+    for row, candidate in enumerate(knots):
+        first.setdefault(candidate.tobytes(), row)
     return np.array(list(first.values()), int)
 
 
 def merged(search: Search, knots: np.ndarray, costs: np.ndarray) -> Search:
     """Return the search with candidates (N, K, J, 3) of costs (N,) among its elites; copies last, at cost inf."""
-    both, known = best_first(np.concatenate([search.elites, knots]), np.concatenate([search.costs, costs]), None)
-    once = distinct(both)
-    copies = np.setdiff1d(np.arange(len(both)), once)
-    order = np.concatenate([once, copies])[: len(search.elites)]
-    return search._replace(elites=both[order], costs=np.where(np.isin(order, copies), np.inf, known[order]))
+    all_knots, all_costs = best_first(
+        np.concatenate([search.elites, knots]), np.concatenate([search.costs, costs]), None
+    )
+    first = distinct(all_knots)
+    copies = np.setdiff1d(np.arange(len(all_knots)), first)
+    order = np.concatenate([first, copies])[: len(search.elites)]
+    return search._replace(elites=all_knots[order], costs=np.where(np.isin(order, copies), np.inf, all_costs[order]))
 
 
 def coloured_noise(random: np.random.Generator, shape: tuple[int, ...], exponent: float) -> np.ndarray:

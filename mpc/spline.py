@@ -13,7 +13,7 @@ def interpolate(knots: jax.Array, knot_times: jax.Array, times: jax.Array, kind:
 
     Linear in the knots, and through every one of them. "cubic" is the Hermite spline whose slope at a knot is
     the chord between its neighbours (Catmull and Rom 1974). Before the first and after the last knot it is
-    held.
+    constant.
     """
     times = jnp.clip(times, knot_times[0], knot_times[-1])
     right = jnp.clip(jnp.searchsorted(knot_times, times, side="right"), 1, len(knot_times) - 1)

@@ -22,18 +22,18 @@ class Validation(NamedTuple):
 
 @dataclass(frozen=True)
 class Verified:
-    """The planner's own dynamics propose, truer ones decide, and their verdict corrects the next proposal.
+    """The planner's own dynamics propose, truer ones decide, and their results correct the next proposal.
 
-    Each round tries the best candidates in `dynamics`. Between two rounds `optimizer` searches on in the planner's own
-    dynamics, whose residuals are moved to where they are right for the best candidate so far, theta*:
+    Each round evaluates the best candidates in `dynamics`. Between two rounds `optimizer` searches on in the planner's
+    own dynamics, whose residuals are shifted to be right for the best candidate so far, theta*:
 
         r(theta) = r_model(theta) + r_true(theta*) - r_model(theta*)
 
-    So a model that errs much alike for neighbouring candidates finds a plan that is good in truth after a few
-    rounds, as an archer corrects the aim by the last miss. Where proposals turn out worse, the midpoint is validated
-    next. With `GaussNewton` as the optimizer a round is a step by the truth's residual and the model's Jacobian, and
-    one candidate suffices (model management: N. Alexandrov and R. Lewis, "An Overview of First-Order Model Management
-    for Engineering Optimization", 2001).
+    So a model that errs much alike for neighbouring candidates finds a plan that is good in the truer
+    dynamics after a few rounds, as an archer corrects the aim by the last miss. Where proposals turn out worse, the
+    midpoint is validated next. With `GaussNewton` as the optimizer a round is a step by the truer residual and the
+    model's Jacobian, and one candidate is enough (model management: N. Alexandrov and R. Lewis, "An Overview of
+    First-Order Model Management for Engineering Optimization", 2001).
     """
 
     terminal: ClassVar[bool] = True
@@ -69,9 +69,9 @@ class Verified:
         The elites are ranked by the truer dynamics.
         """
         validations: list[Validation] = []
-        proposed = np.concatenate([search.elites[:1], problem.warm_start[None], search.elites[1:]])
+        proposals = np.concatenate([search.elites[:1], problem.warm_start[None], search.elites[1:]])
         for index in range(self.rounds):
-            knots = not_validated(proposed, validations)[: self.candidates if validations else max(2, self.candidates)]
+            knots = not_validated(proposals, validations)[: self.candidates if validations else max(2, self.candidates)]
             if not len(knots):
                 break
             results = problem.validate(self.dynamics, knots)
@@ -81,14 +81,14 @@ class Verified:
             if index == self.rounds - 1 or converged(self.tolerance, best.cost, best.residuals):
                 break
             if index and not any(best is other for other in validations[-len(knots) :]) and np.isfinite(best.cost):
-                proposed = 0.5 * (best.knots + knots)
+                proposals = 0.5 * (best.knots + knots)
                 continue
             inner = self.corrected(best, problem)
             elites = np.concatenate([best.knots[None], search.elites[:-1]])
             search = search._replace(mean=best.knots, elites=elites, costs=np.full(len(elites), np.inf, np.float32))
             search = self.optimizer.improve(search, random, inner)
-            proposed = search.elites[np.isfinite(search.costs)]
-        # Costs in the planner's own dynamics count no more; where no validation is finite, the warm start stays.
+            proposals = search.elites[np.isfinite(search.costs)]
+        # Costs in the planner's own dynamics no longer count; where no validation is finite, the warm start stays.
         elites = np.concatenate([problem.warm_start[None], search.elites[:-1]])
         search = search._replace(elites=elites, costs=np.full(len(elites), np.inf, np.float32))
         costs = np.array([validation.cost for validation in validations], np.float32)
@@ -98,14 +98,16 @@ class Verified:
     def corrected(best: Validation, problem: Problem) -> Problem:
         """Return the problem with residuals right for the best candidate.
 
-        It is the same one where the candidate is lost in the planner's own dynamics, or in the truer ones.
+        It is the same one where the candidate is not finite in the planner's own dynamics, or in the truer ones.
         """
         if not np.isfinite(best.cost):
             return problem
-        believed = problem.evaluate(best.knots[None])
-        if not np.isfinite(believed.costs[0]):
+        model_results = problem.evaluate(best.knots[None])
+        if not np.isfinite(model_results.costs[0]):
             return problem
-        return problem.corrected({name: true - believed.residuals[name] for name, true in best.residuals.items()})
+        return problem.corrected(
+            {name: residual - model_results.residuals[name] for name, residual in best.residuals.items()}
+        )
 
 
 def not_validated(knots: np.ndarray, validations: list[Validation]) -> np.ndarray:

@@ -29,8 +29,8 @@ class Mover:
 
 
 @dataclass
-class World:
-    """The truth of `Mover`, one step at a time; it remembers the joint targets it was given."""
+class MoverWorld:
+    """The ground truth of `Mover`, one step at a time; it records its joint targets."""
 
     states: np.ndarray = field(default_factory=lambda: np.zeros((1, 2, 13)))
     given: list[np.ndarray] = field(default_factory=list)
@@ -65,7 +65,7 @@ def test_each_phase_plans_with_its_own_planners_for_its_own_links_until_it_is_ov
         Phase(one, one, 2, _window, lambda step, state: step == 5),
         Phase(other, other, 3, _window, lambda step, state: step == 12, links=slice(0, 1)),
     )
-    world = World()
+    world = MoverWorld()
     execution = execute(world, START, phases, 20, jax.random.key(0))
     assert [(plan.step, plan.phase) for plan in execution.plans] == [
         (0, 0), (2, 0), (4, 0), (5, 1), (8, 1), (11, 1),
@@ -84,7 +84,7 @@ def test_weights_of_a_window_replace_those_of_the_terms() -> None:
         def window(step: int) -> Window:
             return _window(step)._replace(weights={"miss": weight})  # noqa: B023
 
-        (plan,) = execute(World(), START, (Phase(planner, planner, 9, window),), 1, jax.random.key(0)).plans
+        (plan,) = execute(MoverWorld(), START, (Phase(planner, planner, 9, window),), 1, jax.random.key(0)).plans
         costs.append(plan.info.cost)
     assert costs[1] == pytest.approx(10.0 * costs[0], rel=1e-4)
 
@@ -95,7 +95,7 @@ def test_a_phase_that_holds_executes_its_plan_further_before_the_next_begins() -
         Phase(one, one, 2, _window, lambda step, state: step == 5, hold_steps=3),
         Phase(other, other, 3, _window),
     )
-    world = World()
+    world = MoverWorld()
     execution = execute(world, START, phases, 12, jax.random.key(0))
     assert [(plan.step, plan.phase) for plan in execution.plans] == [(0, 0), (2, 0), (4, 0), (8, 1), (11, 1)]
     last = execution.plans[2].plan
@@ -106,11 +106,11 @@ def test_a_phase_with_the_planner_of_the_one_before_goes_on_with_its_plan() -> N
     one = _planner()
     ends = [lambda step, state: step == 6, lambda step, state: False]
     phases = [Phase(one, one, every, _window, over) for every, over in zip((2, 5), ends, strict=True)]
-    execution = execute(World(), START, phases, 20, jax.random.key(0))
+    execution = execute(MoverWorld(), START, phases, 20, jax.random.key(0))
     assert [(plan.step, plan.phase) for plan in execution.plans] == [
         (0, 0), (2, 0), (4, 0), (9, 1), (14, 1), (19, 1),
     ]  # fmt: skip
-    alone = execute(World(), START, phases[:1], 6, jax.random.key(0))
+    alone = execute(MoverWorld(), START, phases[:1], 6, jax.random.key(0))
     np.testing.assert_array_equal(execution.states[:7], alone.states)
 
 
@@ -118,9 +118,9 @@ def test_a_phase_with_the_planner_of_the_one_before_goes_on_with_its_plan() -> N
 def test_an_execution_that_was_cut_off_goes_on_as_if_it_had_not_been(cut: int) -> None:
     one, other = _planner(), _planner()
     phases = (Phase(one, one, 2, _window, lambda step, state: step == 5), Phase(other, other, 3, _window))
-    whole = execute(World(), START, phases, 14, jax.random.key(0))
-    part = execute(World(), START, phases, cut, jax.random.key(0))
-    rest = execute(World(), START, phases, 14, jax.random.key(0), checkpoint=Checkpoint.of(part))
+    whole = execute(MoverWorld(), START, phases, 14, jax.random.key(0))
+    part = execute(MoverWorld(), START, phases, cut, jax.random.key(0))
+    rest = execute(MoverWorld(), START, phases, 14, jax.random.key(0), checkpoint=Checkpoint.of(part))
     np.testing.assert_array_equal(rest.states, whole.states)
     np.testing.assert_array_equal(rest.controls, whole.controls)
     assert [each.step for each in (*part.plans, *rest.plans)] == [each.step for each in whole.plans]
@@ -131,7 +131,7 @@ def test_planners_see_what_is_sensed_and_the_truth_goes_on_from_the_truth() -> N
     shift = np.zeros((2, 13))
     shift[:, 0] = 0.25
     execution = execute(
-        World(),
+        MoverWorld(),
         START,
         (Phase(planner, planner, 3, _window),),
         6,
