@@ -71,7 +71,7 @@ class CEM:
     def sample(self, search: Search, random: np.random.Generator, size: int, last: bool) -> np.ndarray:
         """Return candidates (N, K, J, 3) [rad]: elites, best first, then draws, in the last round the mean as well."""
         noise = coloured_noise(random, (size, *search.mean.shape), self.exponent)
-        candidates = search.mean + search.spread * noise
+        candidates: np.ndarray = search.mean + search.spread * noise
         candidates[: self.retained] = search.elites[: self.retained]
         if last:
             candidates[self.retained] = search.mean

@@ -152,7 +152,9 @@ class GaussNewton:
 
     def draw_directions(self, search: Search, random: np.random.Generator) -> np.ndarray:
         """Return the directions (D, K, J, 3) [rad] of a round."""
-        return search.spread * coloured_noise(random, (self.directions, *search.mean.shape), self.exponent)
+        noise = coloured_noise(random, (self.directions, *search.mean.shape), self.exponent)
+        directions: np.ndarray = search.spread * noise
+        return directions
 
     def neighbours(self, knots: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Return the knots (D, K, J, 3) that differences are taken to, none (0, K, J, 3) where they are not taken."""

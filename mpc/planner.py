@@ -47,7 +47,8 @@ class Plan(NamedTuple):
     @property
     def knots(self) -> np.ndarray:
         """Return the knots (K, J, 3) [rad] of the best candidate, never an average."""
-        return self.elites[0]
+        best: np.ndarray = self.elites[0]
+        return best
 
 
 class PlanInfo(NamedTuple):
@@ -204,7 +205,8 @@ class Planner:
 
     def controls(self, plan: Plan, reference: ArrayLike) -> jax.Array:
         """Return joint targets (H, J, 3) [rad] of the plan, given the reference (H, J, 3) it was made around."""
-        return _controls(self._equations, plan.knots, self._reference(reference))
+        controls: jax.Array = _controls(self._equations, plan.knots, self._reference(reference))
+        return controls
 
     def _shift(self, elites: jax.Array, spread: jax.Array, elapsed: jax.Array) -> tuple[jax.Array, jax.Array]:
         times = jnp.asarray(self.knot_times)

@@ -126,7 +126,7 @@ class Programs:
             begin = time.perf_counter()
             self._compiled[signature] = jax.jit(function).lower(*arguments).compile()
             self.seconds += time.perf_counter() - begin
-        return jax.block_until_ready(self._compiled[signature](*arguments))
+        return jax.block_until_ready(self._compiled[signature](*arguments))  # type: ignore[no-untyped-call]
 
 
 @dataclass
@@ -209,7 +209,7 @@ class PlannerProblem:
 
     def _roll_out(self, dynamics: Dynamics, knots: np.ndarray, size: int) -> tuple[Any, Any]:
         """Return the result of `weigh` for knots, and their states: `size` at a time, the last ones filled up."""
-        name, batches = ("roll out", self.run.number(dynamics)), []
+        name, batches = ("roll out", self.run.number(dynamics)), list[tuple[Any, Any]]()
         roll_out, arguments = program_of(self.equations.roll_out, dynamics)
         for begin in range(0, len(knots), size):
             rows = np.minimum(np.arange(begin, begin + size), len(knots) - 1)
@@ -218,7 +218,8 @@ class PlannerProblem:
             batches.append((results, states))
         if len(knots) == size:
             return batches[0]
-        return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(knots)], *batches)
+        results, states = jax.tree.map(lambda *parts: np.concatenate(parts)[: len(knots)], *batches)
+        return results, states
 
     def _add_to_record(self, knots: np.ndarray, results: Any, states: jax.Array) -> Evaluations:
         evaluations = Evaluations(*jax.tree.map(np.asarray, results))

@@ -145,7 +145,8 @@ def coloured_noise(random: np.random.Generator, shape: tuple[int, ...], exponent
     0 is white, 2 a random walk's: neighbouring knots move together (Pinneri et al. 2020, "iCEM").
     """
     white = random.standard_normal(shape, dtype=np.float32)
-    return np.einsum("kl,nljd->nkjd", _colour(shape[1], exponent), white)
+    noise: np.ndarray = np.einsum("kl,nljd->nkjd", _colour(shape[1], exponent), white)
+    return noise
 
 
 @functools.cache
@@ -156,4 +157,5 @@ def _colour(count: int, exponent: float) -> np.ndarray:
     covariance = np.fft.ifft(frequency.astype(float) ** -exponent).real[:count]
     lag = np.abs(index[:count, None] - index[:count])
     value, vector = np.linalg.eigh(covariance[lag] / covariance[0])
-    return ((vector * np.sqrt(np.maximum(value, 0))) @ vector.T).astype(np.float32)
+    root: np.ndarray = (vector * np.sqrt(np.maximum(value, 0))) @ vector.T
+    return root.astype(np.float32)
