@@ -1,6 +1,6 @@
 """Interactive page of a task: its settings are planned for at once; kicks are executed and saved on request.
 
-Planning never waits for the browser: the page draws by itself, and its settings are read before each plan.
+Planning never waits for the browser: the page draws in a thread of its own, and its settings are read before each plan.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from viewer import (
     PageClosedError,
     Push,
     Recording,
-    Wishes,
+    Settings,
     kick_picture,
     page_of,
     write_film,
@@ -47,12 +47,12 @@ ROLLS = ((-2.0, -2.0), (1.0, 2.0))
 # `evaluation.novelty`.
 NOVEL = 4.0
 # Kicks whose errors are shown.
-REMEMBERED = 30
+ERRORS_SHOWN = 30
 FILM = (960, 540)
 
 
 class Choices(NamedTuple):
-    """Options of the page, by name, the default first. tasks: one for each reference, made when needed."""
+    """Options of the page, by name, the default first. tasks: one for each reference, created when needed."""
 
     tasks: Mapping[str, Callable[[], Task]]
     presets: Mapping[str, Preset]
@@ -67,27 +67,27 @@ class Choices(NamedTuple):
 
 
 def weights_for(chosen: Path | None) -> dict[str, Path | None]:
-    """Return the weights that can be chosen, by name: the given ones, if any, and none."""
+    """Return the weights that can be chosen, by name: the chosen ones, if any, and none."""
     return ({} if chosen is None else {chosen.stem: chosen}) | {NO_WEIGHTS: None}
 
 
-class Pushed:
+class PushableWorld:
     """Ground truth in which bodies can be pushed between two steps."""
 
     def __init__(self, scene: Scene, substeps: int) -> None:
         self._truth = Truth(scene, 1, substeps, threads=1)
-        self._scene, self.waiting = scene, list[Push]()
+        self._scene, self.pushes = scene, list[Push]()
 
     def reset(self, states: np.ndarray) -> None:
         """See `mpc.loop.World`."""
         self._truth.reset(states)
 
     def step(self, control: np.ndarray) -> np.ndarray:
-        """See `mpc.loop.World`; before the step, all waiting pushes change the velocities of their bodies."""
-        if self.waiting:
+        """See `mpc.loop.World`; before the step, all pushes that wait change the velocities of their bodies."""
+        if self.pushes:
             states = self._truth.state()
-            while self.waiting:
-                push = self.waiting.pop()
+            while self.pushes:
+                push = self.pushes.pop()
                 states[:, self._scene.rows(push.body), packed.VELOCITY] += push.change
             self._truth.reset(states)
         return self._truth.step(control)
@@ -113,147 +113,151 @@ class Live:
         self._finished = finished
         self._tasks: dict[str, Task] = {}
         self._sessions: dict[tuple[str, str, str], Session] = {}
-        self._fitted: dict[tuple[str, str, str, str, float], Planners] = {}
-        self.errors: deque[tuple[float, float]] = deque(maxlen=REMEMBERED)
+        self._planners: dict[tuple[str, str, str, str, float], Planners] = {}
+        self.errors: deque[tuple[float, float]] = deque(maxlen=ERRORS_SHOWN)
         self.run: Run | None = None
         self.recording: Recording | None = None
-        self.planned_for: Wishes | None = None
+        self.planned_for: Settings | None = None
         self.plans = 0
-        self.kept: dict[str, Path] = {}
+        self.saved: dict[str, Path] = {}
         task = self.task(next(iter(choices.tasks)))
         page.files = self.file
         page.begin(task.scene, target, state=task.start())
-        self._find()
+        self._list_saved()
 
     def task(self, reference: str) -> Task:
-        """Return the task near a reference, by the reference's name; it is made once."""
+        """Return the task near a reference, by the reference's name; it is created once."""
         if reference not in self._tasks:
             self._tasks[reference] = self.choices.tasks[reference]()
         return self._tasks[reference]
 
-    def planners(self, wishes: Wishes) -> Planners:
-        """Return the planners for the page's settings; they are made once."""
-        key = self._key(wishes)
-        if key not in self._fitted:
-            session, preset = self.session(wishes), self.choices.presets[wishes.preset]
-            if wishes.budget:
-                preset = session.within(preset, wishes.budget, wishes.target)
-            self._fitted[key] = session.planners(preset)
-        return self._fitted[key]
+    def planners(self, settings: Settings) -> Planners:
+        """Return the planners for the page's settings; they are created once."""
+        key = self._planner_key(settings)
+        if key not in self._planners:
+            session, preset = self.session(settings), self.choices.presets[settings.preset]
+            if settings.budget:
+                preset = session.within(preset, settings.budget, settings.target)
+            self._planners[key] = session.planners(preset)
+        return self._planners[key]
 
-    def session(self, wishes: Wishes) -> Session:
-        """Return the session for the page's reference, dynamics and weights; it is made once."""
-        key = wishes.reference, wishes.dynamics, wishes.weights
+    def session(self, settings: Settings) -> Session:
+        """Return the session for the page's reference, dynamics and weights; it is created once."""
+        key = settings.reference, settings.dynamics, settings.weights
         if key not in self._sessions:
-            dynamics = next(name for name in self.choices.dynamics if name == wishes.dynamics)
-            weights = self.choices.weights[wishes.weights]
-            self._sessions[key] = Session(self.task(wishes.reference), dynamics, weights)
+            dynamics = next(name for name in self.choices.dynamics if name == settings.dynamics)
+            weights = self.choices.weights[settings.weights]
+            self._sessions[key] = Session(self.task(settings.reference), dynamics, weights)
         return self._sessions[key]
 
     @staticmethod
-    def _key(wishes: Wishes) -> tuple[str, str, str, str, float]:
-        return wishes.reference, wishes.preset, wishes.dynamics, wishes.weights, wishes.budget
+    def _planner_key(settings: Settings) -> tuple[str, str, str, str, float]:
+        return settings.reference, settings.preset, settings.dynamics, settings.weights, settings.budget
 
     def serve(self, first: str | None = None) -> None:
         """Plan and kick on request, until the page is closed. first: a request to begin with, such as `kick`."""
-        seen, ask = -1, first
+        changes_planned, request = -1, first
         try:
             while True:
-                if ask == "kick":
+                if request == "kick":
                     self.carry_out()
-                    seen = self.page.changes  # what was set meanwhile has counted
-                elif ask in ("keep", "open", "beside", "alone"):
-                    self._replays(ask)
-                elif ask == "reset" or seen != self.page.changes:
-                    seen = self.page.changes
+                    changes_planned = self.page.changes  # the kick already used changes made meanwhile
+                elif request in ("keep", "open", "beside", "alone"):
+                    self._handle_replay(request)
+                elif request == "reset" or changes_planned != self.page.changes:
+                    changes_planned = self.page.changes
                     self.plan()
-                ask = self.page.asked(1.0 if seen == self.page.changes else 0.0)
+                request = self.page.next_request(1.0 if changes_planned == self.page.changes else 0.0)
         except (PageClosedError, KeyboardInterrupt):
             self.page.close()
 
     def plan(self) -> None:
         """Plan for the page's settings, and show the plan or that there is none."""
-        wishes = self.page.wishes
-        if (task := self._ready(wishes)) is None:
+        settings = self.page.settings
+        if (task := self._prepare(settings)) is None:
             return
-        planner, window, state = self.planners(wishes).first, self._window(task)(0), start(task, wishes)
+        planner, window, state = self.planners(settings).first, self._window(task)(0), initial_state(task, settings)
         plan, info = planner.step(planner.init(jax.random.key(self.seed)), state, window)
         costs, states = planner.fan(plan, state, window)
-        self.planned_for, self.plans = wishes, self.plans + 1
+        self.planned_for, self.plans = settings, self.plans + 1
         if not np.isfinite(info.cost):
-            self.page.tell("**No plan**: whatever was tried, the model does not know how it ends.")
+            self.page.show_message("**No plan**: whatever was tried, the model does not know how it ends.")
             return
         fan = states[:, :, task.ball, packed.POSITION], costs
         self.page.planned(state, info.states, fan, task.reference.states[0])
-        expected = task.missed(info.states, 1, task.check(wishes.target))
+        expected = task.missed(info.states, 1, task.check(settings.target))
         reach = "" if expected <= REACHABLE else " **Out of reach:** this plan comes nearest."
-        said = f"The model expects to miss by {100.0 * expected:.1f} cm, planned in {info.seconds:.2f} s."
+        expectation = f"The model expects to miss by {100.0 * expected:.1f} cm, planned in {info.seconds:.2f} s."
         controls = np.asarray(planner.controls(plan, window.reference))
-        self.page.tell(f"**Ready.** {said}{reach}\n\n{self._familiar(wishes, state, info.states, controls)}")
+        self.page.show_message(
+            f"**Ready.** {expectation}{reach}\n\n{self._novelty_sentence(settings, state, info.states, controls)}"
+        )
 
     def carry_out(self) -> None:
         """Plan and kick in the ground truth, then play the recording; each plan uses the current target and weights."""
-        wishes = self.page.wishes
-        if (task := self._ready(wishes)) is None:
+        settings = self.page.settings
+        if (task := self._prepare(settings)) is None:
             return
-        world, begun = Pushed(task.scene, task.substeps), time.monotonic()
-        planners, told = self.planners(wishes), list[PlanRecord]()
-        goals = [wishes.target]
+        world, due_time = PushableWorld(task.scene, task.substeps), time.monotonic()
+        planners, records = self.planners(settings), list[PlanRecord]()
+        goals = [settings.target]
 
         def window(step: int) -> Window:
-            goals.append(self.page.wishes.target)
+            goals.append(self.page.settings.target)
             return self._window(task)(step)
 
         def observe(execution: Execution) -> None:
-            nonlocal begun
+            nonlocal due_time
             step = len(execution.states) - 1
             last = plans_of(execution)[-1]
-            news = last.info.states if last.step == step - 1 else None
+            predicted = last.info.states if last.step == step - 1 else None
             reference = task.reference.states
-            self.page.update(execution.states[-1], news, step * task.scene.dt, reference[min(step, len(reference) - 1)])
-            if news is not None:
-                told.append(last)
-                self._told(told, wishes, task.scene.dt)
-            begun = due(begun, task.scene.dt / self.page.speed)
-            self.page.hold(begun)
-            while (ask := self.page.asked()) is not None:
-                if ask.startswith("push "):
-                    body = task.scene.bodies[-1 if ask.endswith("ball") else 0].name
-                    world.waiting.append(self.page.push(body))
-                elif ask in ("reset", "kick"):
-                    raise InterruptedKickError(ask)
+            self.page.update(
+                execution.states[-1], predicted, step * task.scene.dt, reference[min(step, len(reference) - 1)]
+            )
+            if predicted is not None:
+                records.append(last)
+                self._show_figures(records, settings, task.scene.dt)
+            due_time = due(due_time, task.scene.dt / self.page.speed)
+            self.page.hold(due_time)
+            while (request := self.page.next_request()) is not None:
+                if request.startswith("push "):
+                    body = task.scene.bodies[-1 if request.endswith("ball") else 0].name
+                    world.pushes.append(self.page.push(body))
+                elif request in ("reset", "kick"):
+                    raise InterruptedKickError(request)
 
         try:
-            execution = self.session(wishes).execute(
+            execution = self.session(settings).execute(
                 planners,
-                wishes.target,
+                settings.target,
                 self.seed,
-                start(task, wishes),
+                initial_state(task, settings),
                 observe=observe,
                 world=world,
                 window=window,
             )
-            labels = {name: getattr(wishes, name) for name in ("preset", "dynamics", "weights")}
+            labels = {name: getattr(settings, name) for name in ("preset", "dynamics", "weights")}
             self.run = Run.of(task, execution, task.check(goals[-1]), **labels, seed=self.seed)
             self.recording = self.run.recording
-        except InterruptedKickError as ended:
-            if str(ended) == "kick":
-                self.page.ask("kick")
+        except InterruptedKickError as interruption:
+            if str(interruption) == "kick":
+                self.page.request("kick")
             else:
                 self.plan()
             return
         except (DivergenceError, InputError) as error:
-            self.page.tell(f"**Ended:** {error}")
+            self.page.show_message(f"**Ended:** {error}")
             return
         self.errors.append((self.run.truth_error_m, self.run.model_error_m))
-        self._told(told, wishes, task.scene.dt)
+        self._show_figures(records, settings, task.scene.dt)
         self.page.finish(self.recording)
         if len(self.errors) == 1:
-            self._saved(self._finished, self.run)
+            self._try_to_save(self._finished, self.run)
 
     def file(self, kind: str, recording: Recording) -> tuple[str, bytes]:
         """Return a recording as a file: its name and content. kind: the file's extension, such as html or png."""
-        name = f"{self.task(self.page.wishes.reference).name}.{kind}"
+        name = f"{self.task(self.page.settings.reference).name}.{kind}"
         if kind == "html":
             return name, page_of(recording).encode()
         with tempfile.TemporaryDirectory() as folder:
@@ -264,59 +268,63 @@ class Live:
                 write_film(recording, path, FILM, 15.0)
             return name, path.read_bytes()
 
-    def _familiar(self, wishes: Wishes, state: np.ndarray, expected: np.ndarray, controls: np.ndarray) -> str:
+    def _novelty_sentence(
+        self, settings: Settings, state: np.ndarray, expected: np.ndarray, controls: np.ndarray
+    ) -> str:
         """Return a sentence on the plan's novelty to the learned model; empty where nothing is learned."""
-        found = self.session(wishes).models.novelty(np.concatenate([state[None], expected[: len(controls)]]), controls)
-        if found is None:
+        novelty = self.session(settings).models.novelty(
+            np.concatenate([state[None], expected[: len(controls)]]), controls
+        )
+        if novelty is None:
             return ""
-        known = "as in its training" if found <= NOVEL else "**unlike its training: trust it less**"
-        return f"Novelty to the model: {found:.1f}, {known}."
+        judgement = "as in its training" if novelty <= NOVEL else "**unlike its training: trust it less**"
+        return f"Novelty to the model: {novelty:.1f}, {judgement}."
 
     def _window(self, task: Task) -> Callable[[int], Window]:
         """Return a function that gives a plan's window from the settings of the page when the plan is made."""
 
         def at(step: int) -> Window:
-            wishes = self.page.wishes
-            return task.window(wishes.target)(step)._replace(weights=wishes.terms)
+            settings = self.page.settings
+            return task.window(settings.target)(step)._replace(weights=settings.terms)
 
         return at
 
-    def _ready(self, wishes: Wishes) -> Task | None:
-        """Return the task for the settings, its planners made; None, and a message on the page, where that fails."""
+    def _prepare(self, settings: Settings) -> Task | None:
+        """Return the task for the settings and create its planners; if that fails, show why and return None."""
         try:
-            if self._key(wishes) not in self._fitted:
-                self.page.tell("**Setting up** what is new: the first plan compiles, for some seconds.")
-            self.planners(wishes)
-            return self.task(wishes.reference)
+            if self._planner_key(settings) not in self._planners:
+                self.page.show_message("**Setting up** what is new: the first plan compiles, for some seconds.")
+            self.planners(settings)
+            return self.task(settings.reference)
         except InputError as error:
-            self.page.tell(f"**Not possible:** {error}")
+            self.page.show_message(f"**Not possible:** {error}")
             return None
 
-    def _saved(self, save: Callable[[Run], object], run: Run) -> bool:
+    def _try_to_save(self, save: Callable[[Run], object], run: Run) -> bool:
         """Write a run and return whether that worked; the page shows why not."""
         try:
             save(run)
         except (OSError, InputError) as error:
-            self.page.tell(f"**Not written:** {error}")
+            self.page.show_message(f"**Not written:** {error}")
             return False
         return True
 
-    def _told(self, plans: list[PlanRecord], wishes: Wishes, dt: float) -> None:
+    def _show_figures(self, plans: list[PlanRecord], settings: Settings, dt: float) -> None:
         """Show figures of the running kick, and of those before, on the page."""
         if not plans:
             return
-        infos, every = [plan.info for plan in plans], self.planners(wishes).interval
-        again = 1e3 * np.array([info.seconds for info in infos][1:] or [infos[0].seconds])
-        lost = sum(info.candidates - info.finite for info in infos)
+        infos, interval = [plan.info for plan in plans], self.planners(settings).interval
+        replan_ms = 1e3 * np.array([info.seconds for info in infos][1:] or [infos[0].seconds])
+        failed = sum(info.candidates - info.finite for info in infos)
         lines = [
-            f"- plans: first {infos[0].seconds:.2f} s; again {np.quantile(again, 0.5):.0f} ms (p50), "
-            f"{np.quantile(again, 0.99):.0f} ms (p99), every {1e3 * dt * every:.0f} ms",
-            f"- candidates lost: {lost} of {sum(info.candidates for info in infos)}",
+            f"- plans: first {infos[0].seconds:.2f} s; again {np.quantile(replan_ms, 0.5):.0f} ms (p50), "
+            f"{np.quantile(replan_ms, 0.99):.0f} ms (p99), every {1e3 * dt * interval:.0f} ms",
+            f"- candidates lost: {failed} of {sum(info.candidates for info in infos)}",
         ]
         if self.errors:
-            truth, model = 100.0 * np.array(self.errors).T
+            actual, expected = 100.0 * np.array(self.errors).T
             lines.append(
-                f"- missed by {truth.mean():.1f} cm on average of {len(truth)}, the model said {model.mean():.1f}"
+                f"- missed by {actual.mean():.1f} cm on average of {len(actual)}, the model said {expected.mean():.1f}"
             )
         self.page.panel.figures("\n".join(lines))
         self.page.panel.plot(
@@ -326,41 +334,41 @@ class Live:
             errors = dict(zip(("in MuJoCo", "expected"), (100.0 * np.array(self.errors)).T.tolist(), strict=True))
             self.page.panel.plot("Missed by [cm]", errors, "kick")
 
-    def _replays(self, ask: str) -> None:
+    def _handle_replay(self, request: str) -> None:
         """Save the last kick, open a saved one, or show it beside the one being played; `alone` hides it again."""
         page = self.page
-        if ask == "keep" and self.run is not None:
-            place = self.folder / time.strftime("%Y-%m-%d_%H-%M-%S")
-            if self._saved(lambda run: run.save(place), self.run):
-                self._find()
-                page.tell(f"**Kept** as {place.name}.")
-        elif ask == "alone" and page.recording is not None:
+        if request == "keep" and self.run is not None:
+            folder = self.folder / time.strftime("%Y-%m-%d_%H-%M-%S")
+            if self._try_to_save(lambda run: run.save(folder), self.run):
+                self._list_saved()
+                page.show_message(f"**Kept** as {folder.name}.")
+        elif request == "alone" and page.recording is not None:
             page.finish(page.recording)
-        elif (name := page.panel.chosen(list(self.kept))) is not None and ask in ("open", "beside"):
+        elif (name := page.panel.chosen_name(list(self.saved))) is not None and request in ("open", "beside"):
             try:
-                found = opened(self.task(page.wishes.reference), self.kept[name])
+                recording = load_recording(self.task(page.settings.reference), self.saved[name])
             except InputError as error:
-                page.tell(f"**Cannot be opened:** {name}: {error}")
+                page.show_message(f"**Cannot be opened:** {name}: {error}")
                 return
-            other = page.recording if ask == "beside" else None
-            page.finish(found if other is None else other, None if other is None else found)
+            other = page.recording if request == "beside" else None
+            page.finish(recording if other is None else other, None if other is None else recording)
 
-    def _find(self) -> None:
+    def _list_saved(self) -> None:
         """List the kicks that are saved in the run's folder, the newest first, on the page."""
-        found = sorted(self.folder.glob("*/summary.json"), reverse=True)
-        self.kept = {path.parent.name: path.parent for path in found}
-        self.page.panel.kept(list(self.kept))
+        summaries = sorted(self.folder.glob("*/summary.json"), reverse=True)
+        self.saved = {path.parent.name: path.parent for path in summaries}
+        self.page.panel.list_saved(list(self.saved))
 
 
-def start(task: Task, wishes: Wishes) -> np.ndarray:
+def initial_state(task: Task, settings: Settings) -> np.ndarray:
     """Return the state (L, 13) in which a kick begins, with the ball's place and velocity set on the page."""
-    return task.start(np.array(wishes.spot), np.array(wishes.roll))
+    return task.start(np.array(settings.spot), np.array(settings.roll))
 
 
 def due(last: float, step: float) -> float:
     """Return when the next step is due, by `time.monotonic` [s].
 
-    That is `step` after the last one; of lost time at most one `step` is made up for.
+    That is `step` after the last one; after a delay, at most one `step` is caught up.
     """
     return max(last + step, time.monotonic() - step)
 
@@ -369,22 +377,22 @@ class InterruptedKickError(Exception):
     """Request to end the running kick; the message is the request, `reset` or `kick`."""
 
 
-def opened(task: Task, folder: Path) -> Recording:
+def load_recording(task: Task, folder: Path) -> Recording:
     """Return the recording of a saved kick. Raises InputError where it is of another scene, or damaged."""
     try:
         summary = json.loads((folder / "summary.json").read_text())
         with np.load(folder / f"{task.name}.npz", allow_pickle=False) as file:
-            states, predicted, begun = (file[name] for name in ("states", "predicted_states", "plan_step"))
-        goal, lines, before = task.check(tuple(summary["target"])), facts(task, summary), states[int(begun)][None]
+            states, predicted, plan_step = (file[name] for name in ("states", "predicted_states", "plan_step"))
+        target, lines, first = task.check(tuple(summary["target"])), facts(task, summary), states[int(plan_step)][None]
     except Exception as error:  # json, numpy and zipfile raise many kinds for a damaged file
         raise InputError(f"{folder.name} cannot be read: {type(error).__name__}: {error}") from None
     return Recording(
         task.scene,
         states,
-        task.marker(goal),
-        np.concatenate([before, predicted]),
-        int(begun),
+        task.marker(target),
+        np.concatenate([first, predicted]),
+        int(plan_step),
         task.reference.states[: len(states)],
-        f"{task.title(goal)} ({folder.name})",
+        f"{task.title(target)} ({folder.name})",
         lines,
     )

@@ -72,7 +72,7 @@ ORDER = [
     "viewer.checked",
     "viewer.server",
     "viewer.camera",
-    "viewer.wishes",
+    "viewer.settings",
     "viewer.recording",
     "viewer.scene_view",
     "viewer.stage",

@@ -1,4 +1,4 @@
-"""A task on its page, without a browser: what is wished for is within what is offered, what is asked for happens."""
+"""A task on its page, without a browser: settings stay within the offer, and requests are handled."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from larp_model import state as packed
 from larp_model.bodies import human_and_ball
 from larp_model.errors import InputError
 from tasks.kick import Kick
-from tasks.live import ROLLS, SPOTS, TARGETS, Choices, Pushed, opened, start, weights_for
+from tasks.live import ROLLS, SPOTS, TARGETS, Choices, PushableWorld, initial_state, load_recording, weights_for
 from tasks.presets import PRESETS
 from viewer import LivePage, PageClosedError, Push
 from viewer.camera import VIEWS, PictureCamera, View
 from viewer.handles import Handles
-from viewer.recording import known
+from viewer.recording import mask_unpredicted
 
 SCENE = human_and_ball()
 
@@ -39,12 +39,12 @@ def page(kick: Kick) -> Iterator[LivePage]:
         yield page
 
 
-def test_what_is_wished_for_at_first_is_what_is_usual(page: LivePage, kick: Kick) -> None:
-    wishes = page.wishes
-    assert wishes.target == (4.0, 0.0, 0.5) and wishes.spot == wishes.roll == (0.0, 0.0)
-    assert (wishes.preset, wishes.dynamics, wishes.weights) == (next(iter(PRESETS)), "larp", "none")
-    assert dict(wishes.terms) == {term.name: term.weight for term in kick.terms}
-    np.testing.assert_array_equal(start(kick, wishes), kick.start())
+def test_the_first_settings_are_the_defaults(page: LivePage, kick: Kick) -> None:
+    settings = page.settings
+    assert settings.target == (4.0, 0.0, 0.5) and settings.spot == settings.roll == (0.0, 0.0)
+    assert (settings.preset, settings.dynamics, settings.weights) == (next(iter(PRESETS)), "larp", "none")
+    assert dict(settings.terms) == {term.name: term.weight for term in kick.terms}
+    np.testing.assert_array_equal(initial_state(kick, settings), kick.start())
 
 
 @pytest.mark.parametrize(
@@ -56,39 +56,39 @@ def test_whatever_is_dragged_stays_within_what_is_offered(
 ) -> None:
     handles = page._handles
     assert isinstance(handles, Handles)
-    handles._take(name, np.array(place))
-    found = np.array(getattr(page.wishes, name))
-    assert (found >= np.array(box[0]) - 1e-12).all() and (found <= np.array(box[1]) + 1e-12).all()
+    handles._set_value(name, np.array(place))
+    value = np.array(getattr(page.settings, name))
+    assert (value >= np.array(box[0]) - 1e-12).all() and (value <= np.array(box[1]) + 1e-12).all()
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1.0, 1e9, "much", None])
 def test_whatever_a_client_sends_weights_stay_within_what_is_offered(value: object, page: LivePage) -> None:
     page.panel._terms["effort"]._impl.value = value
-    assert 0.0 <= page.wishes.terms["effort"] <= 5.0 * 0.5
+    assert 0.0 <= page.settings.terms["effort"] <= 5.0 * 0.5
 
 
-def test_a_drag_is_a_change_and_what_is_asked_for_is_handed_on_in_order(page: LivePage) -> None:
+def test_a_drag_is_a_change_and_requests_are_handed_on_in_order(page: LivePage) -> None:
     changes = page.changes
     page.aim(np.array([3.0, 0.5, 0.4]))
-    assert page.changes == changes + 1 and page.wishes.target == (3.0, 0.5, 0.4)
-    page.ask("kick")
-    page.ask("push ball")
-    assert [page.asked(), page.asked(), page.asked()] == ["kick", "push ball", None]
+    assert page.changes == changes + 1 and page.settings.target == (3.0, 0.5, 0.4)
+    page.request("kick")
+    page.request("push ball")
+    assert [page.next_request(), page.next_request(), page.next_request()] == ["kick", "push ball", None]
     page.close()
     with pytest.raises(PageClosedError):
-        page.asked(10.0)
+        page.next_request(10.0)
 
 
-def test_time_that_stands_still_holds_whoever_kicks_until_a_step_is_asked_for(page: LivePage, kick: Kick) -> None:
+def test_a_paused_page_makes_a_kick_wait_until_a_step_is_requested(page: LivePage, kick: Kick) -> None:
     page.hold(0.0)
     page.update(kick.start(), None, 0.0)
-    page.ask("play")
+    page.request("play")
     assert not page.playing
     held = threading.Thread(target=page.hold, args=(0.0,))
     held.start()
     held.join(0.2)
     assert held.is_alive()
-    page.ask("step")
+    page.request("step")
     held.join(5.0)
     assert not held.is_alive()
     page.close()
@@ -98,13 +98,13 @@ def test_time_that_stands_still_holds_whoever_kicks_until_a_step_is_asked_for(pa
 
 def test_a_push_changes_the_velocity_of_its_body_alone(kick: Kick) -> None:
     start, control = kick.start(), kick.reference.controls[:1]
-    usual, pushed = Pushed(kick.scene, 4), Pushed(kick.scene, 4)
+    usual, pushed = PushableWorld(kick.scene, 4), PushableWorld(kick.scene, 4)
     for world in (usual, pushed):
         world.reset(start[None])
-    pushed.waiting.append(Push("ball", (0.0, 2.0, 1.0)))
+    pushed.pushes.append(Push("ball", (0.0, 2.0, 1.0)))
     apart = (pushed.step(control) - usual.step(control))[0, :, packed.VELOCITY]
     np.testing.assert_allclose(apart[-1, 1:], (2.0, 1.0), atol=0.15)
-    assert abs(apart[:-1]).max() < 1e-6 and not pushed.waiting
+    assert abs(apart[:-1]).max() < 1e-6 and not pushed.pushes
 
 
 def test_weights_that_are_chosen_come_first_and_none_can_be_had() -> None:
@@ -118,7 +118,7 @@ def test_a_kept_kick_of_another_scene_or_damaged_is_refused(kick: Kick, tmp_path
     for damage in (lambda path: None, lambda path: path.write_bytes(b"PK"), other_scene):
         damage(tmp_path / "kick.npz")
         with pytest.raises(InputError, match=r"cannot be read|has shape"):
-            opened(kick, tmp_path)
+            load_recording(kick, tmp_path)
 
 
 def other_scene(path: Path) -> None:
@@ -129,9 +129,9 @@ def test_a_prediction_is_shown_as_far_as_it_was_worked_out() -> None:
     states = np.zeros((6, len(SCENE.links), 13))
     states[:, :, 0] = np.minimum(np.arange(6), 3)[:, None]
     states[:, -1, 0] = np.arange(6)
-    found = known(states)
-    assert np.isfinite(found[:4]).all() and np.isfinite(found[:, -1]).all()
-    assert np.isnan(found[4:, :-1]).all()
+    masked = mask_unpredicted(states)
+    assert np.isfinite(masked[:4]).all() and np.isfinite(masked[:, -1]).all()
+    assert np.isnan(masked[4:, :-1]).all()
 
 
 @given(st.sampled_from(VIEWS), st.floats(0.3, 3.0), st.integers(0, 100))

@@ -21,7 +21,7 @@ from mpc import CEM
 from tasks.kick import Kick
 from tasks.live import Choices, Live
 from tasks.presets import Preset
-from viewer import LivePage, Wishes, write_html
+from viewer import LivePage, Settings, write_html
 from viewer.camera import VIEWS
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def until(what: Callable[[], object], seconds: float = 60.0) -> None:
         time.sleep(0.05)
 
 
-def planned_for(served: Served) -> Wishes:
+def planned_for(served: Served) -> Settings:
     """What the last plan that waits to be carried out is for."""
     assert served.live.planned_for is not None
     return served.live.planned_for
@@ -209,22 +209,22 @@ def test_what_is_dragged_changes_the_plan(seen: Page, served: Served) -> None:
     seen.get_by_text("Reset", exact=True).click()
     until(lambda: served.page.mode == "planned")
     time.sleep(2.0)
-    before, plans = served.page.wishes.target, served.live.plans
+    before, plans = served.page.settings.target, served.live.plans
     # The arrow that points up is one of few things whose place in the picture is known: above the target.
     drag(seen, placed(seen, served, np.add(before, (0.0, 0.0, 0.25))), up=40)
-    until(lambda: served.page.wishes.target != before)
-    assert served.page.wishes.target[2] > before[2]
-    until(lambda: served.live.plans > plans and planned_for(served).target == served.page.wishes.target)
+    until(lambda: served.page.settings.target != before)
+    assert served.page.settings.target[2] > before[2]
+    until(lambda: served.live.plans > plans and planned_for(served).target == served.page.settings.target)
 
 
 def test_a_slider_changes_the_weight_of_its_cost_and_the_plan(seen: Page, served: Served) -> None:
-    before = served.page.wishes.terms["effort"]
+    before = served.page.settings.terms["effort"]
     seen.get_by_role("tab", name="Costs").click()
     enter(seen, "effort", "2.5")
-    until(lambda: served.page.wishes.terms["effort"] == 2.5)
+    until(lambda: served.page.settings.terms["effort"] == 2.5)
     until(lambda: planned_for(served).terms["effort"] == 2.5)
     seen.get_by_role("button", name="As they were").click()
-    until(lambda: served.page.wishes.terms["effort"] == before)
+    until(lambda: served.page.settings.terms["effort"] == before)
 
 
 def beside(seen: Page, label: str) -> Locator:
@@ -239,9 +239,9 @@ def enter(seen: Page, label: str, value: str) -> None:
     number.press("Enter")
 
 
-@pytest.mark.parametrize(("wish", "arrow"), [("spot", (0.28, 0.0, 0.0)), ("roll", (0.2, 0.0, 0.35))])
+@pytest.mark.parametrize(("setting", "arrow"), [("spot", (0.28, 0.0, 0.0)), ("roll", (0.2, 0.0, 0.35))])
 def test_the_ball_is_dragged_to_where_it_lies_and_by_how_it_rolls(
-    wish: str, arrow: tuple[float, ...], seen: Page, served: Served
+    setting: str, arrow: tuple[float, ...], seen: Page, served: Served
 ) -> None:
     handles = served.page._handles
     assert handles is not None
@@ -249,10 +249,10 @@ def test_the_ball_is_dragged_to_where_it_lies_and_by_how_it_rolls(
         seen.get_by_text("Reset", exact=True).click()
         until(lambda: served.page.mode == "planned")
     time.sleep(2.0)
-    before = getattr(served.page.wishes, wish)
-    drag(seen, placed(seen, served, np.add(handles.resting, arrow)), right=20)
-    until(lambda: getattr(served.page.wishes, wish) != before)
-    until(lambda: getattr(planned_for(served), wish) == getattr(served.page.wishes, wish))
+    before = getattr(served.page.settings, setting)
+    drag(seen, placed(seen, served, np.add(handles.ball_position, arrow)), right=20)
+    until(lambda: getattr(served.page.settings, setting) != before)
+    until(lambda: getattr(planned_for(served), setting) == getattr(served.page.settings, setting))
 
 
 @pytest.mark.parametrize(
@@ -269,7 +269,7 @@ def test_the_next_plan_is_by_what_is_chosen_from_a_list(
     label: str, field: str, value: str, seen: Page, served: Served
 ) -> None:
     seen.get_by_role("tab", name="Kick").click()
-    before = getattr(served.page.wishes, field)
+    before = getattr(served.page.settings, field)
     for chosen in (value, before):
         choose(seen, label, chosen)
         until(lambda: getattr(planned_for(served), field) == chosen, 120.0)  # noqa: B023
@@ -312,8 +312,8 @@ def test_a_kick_is_kept_opened_again_and_shown_beside_another(played: Page, serv
     seen = played
     seen.get_by_role("tab", name="Kept").click()
     seen.get_by_role("button", name="Keep this kick").click()
-    until(lambda: served.live.kept)
-    (folder,) = served.live.kept.values()
+    until(lambda: served.live.saved)
+    (folder,) = served.live.saved.values()
     assert {path.name for path in folder.iterdir()} == {"summary.json", "kick.npz", "kick.png", "kick.html"}
     last = served.page.recording
     seen.get_by_role("button", name="Open", exact=True).click()
@@ -380,7 +380,7 @@ def test_each_client_looks_from_where_it_likes(view: str, played: Page, served: 
     stage = served.page._stage
     assert stage is not None
     if view in VIEWS:
-        until(lambda: np.allclose(client.camera.position, stage.camera(view, client.camera.aspect).place, atol=0.05))
+        until(lambda: np.allclose(client.camera.position, stage.camera(view, client.camera.aspect).position, atol=0.05))
 
 
 @pytest.mark.parametrize("ghost", ["prediction", "reference", "fan"])

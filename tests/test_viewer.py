@@ -19,7 +19,7 @@ from larp_model.bodies import human_and_ball
 from larp_model.errors import InputError
 from larp_model.state import ORIENTATION, POSITION, VELOCITY
 from viewer import LivePage, Recording, check_film, kick_picture, nearest_approach, write_film, write_html
-from viewer.app import Moment, News
+from viewer.app import LiveData, StateUpdate
 from viewer.camera import PictureCamera
 from viewer.film import frames
 from viewer.panel import Panel
@@ -153,7 +153,7 @@ def test_page_follows_and_plays(page: LivePage, recording: Recording, capsys: py
     assert time.monotonic() - began < 0.5, "update must not wait for the drawing"
     page.finish(recording)
     time.sleep(0.2)
-    assert page._recording is recording and page._drawn is not None
+    assert page._recording is recording and page._drawn_frame is not None
     page.close()
     assert not page._thread.is_alive()
     assert capsys.readouterr().out == ""
@@ -163,18 +163,18 @@ def test_page_follows_and_plays(page: LivePage, recording: Recording, capsys: py
 def test_states_that_come_in_bursts_are_drawn_in_order_and_never_far_behind(burst: int, pictures: int) -> None:
     states = np.zeros((10 * burst, len(SCENE.links), 13))
     states[:, :, 0] = np.arange(len(states))[:, None]
-    news, came = News(states[0], 0.0), 0
+    live, came = LiveData(states[0], 0.0), 0
     for _ in range(10):
         for _ in range(burst):
-            news.waiting.append(Moment(states[came], came * SCENE.dt, None, None))
+            live.updates.append(StateUpdate(states[came], came * SCENE.dt, None, None))
             came += 1
         for _ in range(pictures):
-            waited = len(news.waiting)
-            news.fresh = False
-            news.go_on()
-            assert news.fresh == (waited > 0) and len(news.waiting) < max(waited, 1)
-        assert len(news.waiting) <= max(burst, 5 * burst // pictures)
-    np.testing.assert_array_equal(np.array(news.path)[:, 0, 0], np.arange(came - len(news.waiting)))
+            waited = len(live.updates)
+            live.state_is_new = False
+            live.advance()
+            assert live.state_is_new == (waited > 0) and len(live.updates) < max(waited, 1)
+        assert len(live.updates) <= max(burst, 5 * burst // pictures)
+    np.testing.assert_array_equal(np.array(live.path)[:, 0, 0], np.arange(came - len(live.updates)))
 
 
 def test_update_needs_a_scene(page: LivePage, recording: Recording) -> None:
@@ -280,5 +280,5 @@ def test_a_file_is_not_handed_to_a_client_that_has_left(page: LivePage, recordin
     page.finish(recording)
     page.files = lambda kind, recording: ("kick.html", b"<!doctype html>")
     page._download(gone, "html")
-    assert page._filing.acquire(timeout=30.0), "the next file may be made"
+    assert page._download_lock.acquire(timeout=30.0), "the next file may be made"
     gone.send_file_download.assert_not_called()

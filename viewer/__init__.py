@@ -8,7 +8,7 @@ from viewer.recording import Approach, Recording, nearest_approach
 from viewer.replay import framed, page_of, write_html
 from viewer.scene_view import SceneView
 from viewer.server import require_address
-from viewer.wishes import Offer, Push, Wishes
+from viewer.settings import Offer, Push, Settings
 
 __all__ = [
     "Approach",
@@ -19,7 +19,7 @@ __all__ = [
     "Push",
     "Recording",
     "SceneView",
-    "Wishes",
+    "Settings",
     "check_film",
     "framed",
     "kick_picture",

@@ -27,16 +27,16 @@ from viewer.camera import VIEWS, View
 from viewer.checked import within
 from viewer.handles import Handles
 from viewer.panel import Panel
-from viewer.recording import Recording, known, nearest_approach
+from viewer.recording import Recording, mask_unpredicted, nearest_approach
 from viewer.server import address_of, close_server, open_server
-from viewer.stage import LEGEND, Stage, whole
-from viewer.wishes import Offer, Push, Wishes
+from viewer.settings import Offer, Push, Settings
+from viewer.stage import LEGEND, Stage, points_in_view
 
 FRAME = 1.0 / 25.0  # s
-# Frames by which drawing may lag behind the execution, whose states arrive in bursts.
-BEHIND = 5
+# Frames by which drawing may be behind the execution, whose states arrive in bursts.
+LAG = 5
 # Clients that are served at the full frame rate; with more it drops, for each of them costs the planner some time.
-AT_FULL_PACE = 5
+FULL_RATE_CLIENTS = 5
 FOLLOWED = (-2.2, -3.2, 1.4)  # m, from the ball to a camera that follows it
 
 Mode = Literal["waiting", "planned", "running", "replay"]
@@ -46,7 +46,7 @@ class PageClosedError(Exception):
     """Error raised by calls that wait for the page once it is closed."""
 
 
-class Moment(NamedTuple):
+class StateUpdate(NamedTuple):
     """State (L, 13) of the ground truth at a time [s], the new prediction from there, and the reference's state."""
 
     state: np.ndarray
@@ -56,8 +56,8 @@ class Moment(NamedTuple):
 
 
 @dataclass
-class News:
-    """Data to be drawn next; a plan, fan or reference that is None is not drawn."""
+class LiveData:
+    """Data of a kick that is planned or running; a plan, fan or reference that is None is not drawn."""
 
     state: np.ndarray
     time: float
@@ -66,18 +66,18 @@ class News:
     plan_time: float = 0.0
     fan: tuple[np.ndarray, np.ndarray] | None = None
     reference: np.ndarray | None = None
-    fresh: bool = True  # not drawn yet
-    planned: bool = True  # the plan and its fan are not drawn yet
-    waiting: deque[Moment] = field(default_factory=deque)
+    state_is_new: bool = True  # the state is not drawn yet
+    plan_is_new: bool = True  # the plan and its fan are not drawn yet
+    updates: deque[StateUpdate] = field(default_factory=deque)
 
-    def go_on(self) -> None:
-        """Advance to the next waiting moment, or skip some if many wait: they arrive in bursts, between plans."""
-        for _ in range(-(-len(self.waiting) // BEHIND)):
-            moment = self.waiting.popleft()
-            if moment.predicted is not None:
-                self.plan, self.plan_time, self.planned = known(moment.predicted), moment.time, True
-            self.path.append(moment.state)
-            self.state, self.time, self.reference, self.fresh = moment.state, moment.time, moment.reference, True
+    def advance(self) -> None:
+        """Take the next update, or skip some if many wait: they arrive in bursts, between plans."""
+        for _ in range(-(-len(self.updates) // LAG)):
+            update = self.updates.popleft()
+            if update.predicted is not None:
+                self.plan, self.plan_time, self.plan_is_new = mask_unpredicted(update.predicted), update.time, True
+            self.path.append(update.state)
+            self.state, self.time, self.reference, self.state_is_new = update.state, update.time, update.reference, True
 
 
 class LivePage:
@@ -85,7 +85,7 @@ class LivePage:
 
     `begin`, `planned`, `update` and `finish` return at once; a thread draws one state after the other, and skips some
     if they arrive faster than they can be drawn. With an offer, users choose the settings of the next kick on the page:
-    see `wishes` and `asked`. Leaving the `with` block closes the page.
+    see `settings` and `next_request`. Leaving the `with` block closes the page.
     """
 
     def __init__(
@@ -102,24 +102,24 @@ class LivePage:
         self._server = open_server(host, port, allowed)
         self.address = address_of(self._server)
         self.offer = offer
-        self._lock, self._closed, self._moved = threading.RLock(), threading.Event(), threading.Event()
-        self._rests = threading.Event()  # set while the planner waits for the clock
+        self._lock, self._closed, self._wake = threading.RLock(), threading.Event(), threading.Event()
+        self._idle = threading.Event()  # set while the planner waits for the clock
         self._changes = self._frames = 0
-        self._asked: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._requests: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._mode: Mode = "waiting"
         self._stage: Stage | None = None
         self._handles: Handles | None = None
-        self._news: News | None = None
+        self._live: LiveData | None = None
         self._recording: Recording | None = None
         self._beside: Recording | None = None
-        self._drawn: tuple[int, frozenset[str]] | None = None  # row of the recording that is drawn, and ghosts
-        self._single = 0  # single steps still to take while paused
+        self._drawn_frame: tuple[int, frozenset[str]] | None = None  # row of the recording that is drawn, and ghosts
+        self._single_steps = 0  # single steps still to take while paused
         self._views: dict[int, tuple[str, float]] = {}  # by client: its view, and the aspect this was for
-        self._filing = threading.Lock()
+        self._download_lock = threading.Lock()
         self.files: Callable[[str, Recording], tuple[str, bytes]] | None = None
-        self._panel = Panel(self._server.gui, self._ask, self._change, offer)
-        self._server.on_client_connect(self._welcome)
-        self._server.on_client_disconnect(self._part)
+        self._panel = Panel(self._server.gui, self._handle_request, self._change, offer)
+        self._server.on_client_connect(self._connect)
+        self._server.on_client_disconnect(self._disconnect)
         self._thread = threading.Thread(target=self._draw, daemon=True)
         self._thread.start()
 
@@ -130,37 +130,37 @@ class LivePage:
             self._changes += 1
             if self._stage and self._handles and self._mode != "replay":
                 self._stage.lane.aim(np.array(self._handles.target))
-        self._moved.set()
+        self._wake.set()
 
-    def _ask(self, name: str, client: viser.ClientHandle | None) -> None:
+    def _handle_request(self, request_name: str, client: viser.ClientHandle | None) -> None:
         """Handle at once requests that concern only the page, and queue all others for the planner."""
-        if name == "play":
+        if request_name == "play":
             self._panel.playing = not self._panel.playing
-        elif name == "step":
+        elif request_name == "step":
             with self._lock:
                 self._panel.playing = False
-                self._single += self._mode == "running"
+                self._single_steps += self._mode == "running"
                 if self._recording is not None:
                     self._panel.move(self._recording.scene.dt)
-        elif name == "weights":
-            self._panel.as_at_first()
+        elif request_name == "weights":
+            self._panel.reset_weights()
             self._change()
-        elif name == "look":
+        elif request_name == "look":
             with self._lock:
-                self._drawn = None
-                if self._news:
-                    self._news.fresh = self._news.planned = True
-        elif name.startswith("view ") and client is not None:
-            self._look(client, name.removeprefix("view "))
-        elif name.startswith("download ") and client is not None:
-            self._download(client, name.removeprefix("download "))
+                self._drawn_frame = None
+                if self._live:
+                    self._live.state_is_new = self._live.plan_is_new = True
+        elif request_name.startswith("view ") and client is not None:
+            self._set_view(client, request_name.removeprefix("view "))
+        elif request_name.startswith("download ") and client is not None:
+            self._download(client, request_name.removeprefix("download "))
         else:
-            self._asked.put(name)
-        self._moved.set()
+            self._requests.put(request_name)
+        self._wake.set()
 
-    def ask(self, name: str) -> None:
+    def request(self, name: str) -> None:
         """Request an action by name as a client would, for instance "kick", "reset" or "push ball"."""
-        self._ask(name, None)
+        self._handle_request(name, None)
 
     def aim(self, target: np.ndarray) -> None:
         """Move the target to (3,) [m], clipped to the box that is offered, as if it had been dragged."""
@@ -180,31 +180,33 @@ class LivePage:
         return self._mode
 
     @property
-    def wishes(self) -> Wishes:
+    def settings(self) -> Settings:
         """Return the settings now chosen on the page; requires an offer, and `begin` before."""
         with self._lock:
             assert self._handles is not None
-            return Wishes(self._handles.target, self._handles.spot, self._handles.roll, **self._panel.asked_for())
+            return Settings(
+                self._handles.target, self._handles.spot, self._handles.roll, **self._panel.chosen_settings()
+            )
 
     @property
     def changes(self) -> int:
         """Return the number of times that a setting has changed."""
         return self._changes
 
-    def asked(self, seconds: float = 0.0) -> str | None:
+    def next_request(self, seconds: float = 0.0) -> str | None:
         """Return the next request, or None if none arrives within `seconds`. Raises `PageClosedError` once closed."""
         end = clock.monotonic() + seconds
         while True:
             if self._closed.is_set():
                 raise PageClosedError
             with suppress(queue.Empty):
-                return self._asked.get_nowait()
+                return self._requests.get_nowait()
             if (left := end - clock.monotonic()) <= 0.0:
                 return None
-            self._moved.clear()
-            if self._asked.empty():
-                self._moved.wait(left)
-                if self._asked.empty():
+            self._wake.clear()
+            if self._requests.empty():
+                self._wake.wait(left)
+                if self._requests.empty():
                     return None
 
     def push(self, name: str) -> Push:
@@ -213,11 +215,11 @@ class LivePage:
 
     def hold(self, until: float) -> None:
         """Wait until `until` [s] of the monotonic clock, and for as long as the page is paused."""
-        self._rests.set()
+        self._idle.set()
         try:
             self._wait_for(until)
         finally:
-            self._rests.clear()
+            self._idle.clear()
 
     def _wait_for(self, until: float) -> None:
         while not self._closed.is_set():
@@ -228,11 +230,11 @@ class LivePage:
                 self._closed.wait(min(left, FRAME))
             else:
                 with self._lock:
-                    if self._single:
-                        self._single -= 1
+                    if self._single_steps:
+                        self._single_steps -= 1
                         return
-                if not self._asked.empty():
-                    return  # it may be asked to end
+                if not self._requests.empty():
+                    return  # the request may be to end
                 self._closed.wait(FRAME)
         raise PageClosedError
 
@@ -256,17 +258,19 @@ class LivePage:
         """
         with self._lock:
             self._stage = Stage(self._server, scene, target, traced)
-            seen = np.array([(0.0, 0.0, 0.0), (0.0, 0.0, 1.8)]) if state is None else np.asarray(state)[:, POSITION]
-            self._stage.frame(np.concatenate([seen, np.asarray(target, float)[None]]))
-            self._recording, self._beside, self._news = None, None, None
-            self._mode, self._single = "waiting", 0
+            link_positions = (
+                np.array([(0.0, 0.0, 0.0), (0.0, 0.0, 1.8)]) if state is None else np.asarray(state)[:, POSITION]
+            )
+            self._stage.frame(np.concatenate([link_positions, np.asarray(target, float)[None]]))
+            self._recording, self._beside, self._live = None, None, None
+            self._mode, self._single_steps = "waiting", 0
             if self.offer is not None:
                 assert state is not None
                 ball = self._stage.lane.position(state)
                 self._handles = Handles(self._server, self.offer, tuple(target), ball, self._change)
             if state is not None:
                 self._stage.lane.show(state)
-            self._panel.watch()
+            self._panel.hide_clock()
 
     def planned(
         self,
@@ -283,11 +287,11 @@ class LivePage:
             assert self._stage is not None
             if self._handles:
                 self._stage.lane.aim(np.array(self._handles.target))
-                self._handles.shown(True)
+                self._handles.show_all(True)
             self._stage.compare(None)
             self._recording, self._beside, self._mode = None, None, "planned"
-            self._news = News(np.array(state), 0.0, [], known(expected), 0.0, fan, reference)
-            self._panel.watch()
+            self._live = LiveData(np.array(state), 0.0, [], mask_unpredicted(expected), 0.0, fan, reference)
+            self._panel.hide_clock()
 
     def update(
         self, state: np.ndarray, predicted: np.ndarray | None, time: float, reference: np.ndarray | None = None
@@ -301,15 +305,15 @@ class LivePage:
             if self._stage is None:
                 raise InputError("update came before begin, but the page needs a scene first")
             if self._mode != "running":
-                self._mode, self._recording, self._beside, self._single = "running", None, None, 0
-                self._news, self._panel.playing = News(np.array(state), time), True
+                self._mode, self._recording, self._beside, self._single_steps = "running", None, None, 0
+                self._live, self._panel.playing = LiveData(np.array(state), time), True
                 self._stage.compare(None)
                 if self._handles:
                     self._stage.lane.aim(np.array(self._handles.target))
-                    self._handles.shown(False)
-                self._panel.watch()
-            assert self._news is not None
-            self._news.waiting.append(Moment(np.array(state), time, predicted, reference))
+                    self._handles.show_all(False)
+                self._panel.hide_clock()
+            assert self._live is not None
+            self._live.updates.append(StateUpdate(np.array(state), time, predicted, reference))
 
     def finish(self, recording: Recording, beside: Recording | None = None) -> None:
         """Load a recording for replay, and optionally another to be drawn beside it."""
@@ -319,21 +323,21 @@ class LivePage:
             stage = self._stage
             assert stage is not None
             stage.lane.aim(recording.target)
-            stage.frame(whole(recording))
+            stage.frame(points_in_view(recording))
             stage.lane.trace(recording.path, recording.predicted_path)
             stage.lane.fan(None)
             lane = stage.compare(None if beside is None else beside.target)
             if lane is not None and beside is not None:
                 lane.trace(beside.path, beside.predicted_path)
             if self._handles:
-                self._handles.shown(True)
-            both = [recording, *([] if beside is None else [beside])]
-            self._panel.write("\n\n".join([*map(described, both), LEGEND]))
-            self._panel.play(max(each.duration for each in both), recording.scene.dt)
-            self._recording, self._beside, self._drawn, self._news = recording, beside, None, None
+                self._handles.show_all(True)
+            recordings = [recording, *([] if beside is None else [beside])]
+            self._panel.write("\n\n".join([*map(summary_text, recordings), LEGEND]))
+            self._panel.play(max(replayed.duration for replayed in recordings), recording.scene.dt)
+            self._recording, self._beside, self._drawn_frame, self._live = recording, beside, None, None
             self._mode = "replay"
 
-    def tell(self, text: str) -> None:
+    def show_message(self, text: str) -> None:
         """Show a status text in Markdown."""
         self._panel.write(f"{text}\n\n{LEGEND}")
 
@@ -358,7 +362,7 @@ class LivePage:
         """Stop drawing and serving."""
         if not self._closed.is_set():
             self._closed.set()
-            self._moved.set()
+            self._wake.set()
             self._thread.join()
             close_server(self._server)
 
@@ -375,16 +379,16 @@ class LivePage:
     def _draw(self) -> None:
         last = due = clock.monotonic()
         while not self._closed.wait(max(0.0, due - clock.monotonic())):
-            pace = FRAME * max(1.0, len(self._views) / AT_FULL_PACE)
+            pace = FRAME * max(1.0, len(self._views) / FULL_RATE_CLIENTS)
             if self._mode == "running":
-                self._rests.wait(pace)  # otherwise it would take one of few cores from the planner
+                self._idle.wait(pace)  # otherwise it would take one of few cores from the planner
             now = clock.monotonic()
             due = max(due + pace, now + 0.5 * pace)
             with self._lock:
                 if self._recording is not None:
                     self._draw_recording(self._recording, now - last)
-                elif self._stage is not None and self._news is not None:
-                    self._draw_news(self._stage, self._news)
+                elif self._stage is not None and self._live is not None:
+                    self._draw_live(self._stage, self._live)
             last = now
 
     def _draw_recording(self, recording: Recording, elapsed: float) -> None:
@@ -392,67 +396,71 @@ class LivePage:
         assert stage is not None
         row = round(self._panel.advance(elapsed) / recording.scene.dt)
         ghosts = frozenset(self._panel.ghosts)
-        if (row, ghosts) == self._drawn:
+        if (row, ghosts) == self._drawn_frame:
             return
-        for lane, each in ((stage.lane, recording), (stage.beside, self._beside)):
-            if lane is not None and each is not None:
-                own = min(row, len(each.states) - 1)
-                lane.shown = set(ghosts)
-                lane.show(each.states[own], prediction=each.predicted_at(own), reference=each.reference_at(own))
+        for lane, replayed in ((stage.lane, recording), (stage.beside, self._beside)):
+            if lane is not None and replayed is not None:
+                lane_row = min(row, len(replayed.states) - 1)
+                lane.visible_ghosts = set(ghosts)
+                lane.show(
+                    replayed.states[lane_row],
+                    prediction=replayed.predicted_at(lane_row),
+                    reference=replayed.reference_at(lane_row),
+                )
         self._follow(stage.lane.position(recording.states[min(row, len(recording.states) - 1)]))
-        self._drawn = row, ghosts
+        self._drawn_frame = row, ghosts
         self._frames += 1
 
-    def _draw_news(self, stage: Stage, news: News) -> None:
-        """Draw what has changed since the last frame; the ghost of a plan that waits keeps moving."""
-        news.go_on()
-        lane, plan, waits = stage.lane, news.plan, self._mode == "planned"
-        if not news.fresh and not (waits and self._panel.playing):
+    def _draw_live(self, stage: Stage, live: LiveData) -> None:
+        """Draw what has changed since the last frame; the ghost of a plan that is not executed yet keeps moving."""
+        live.advance()
+        lane, plan, is_waiting = stage.lane, live.plan, self._mode == "planned"
+        if not live.state_is_new and not (is_waiting and self._panel.playing):
             return
-        lane.shown = self._panel.ghosts
-        expected = None
+        lane.visible_ghosts = self._panel.ghosts
+        predicted = None
         if plan is not None:
-            step = round((news.time - news.plan_time) / stage.scene.dt)
-            if waits:
+            step = round((live.time - live.plan_time) / stage.scene.dt)
+            if is_waiting:
                 step = int(clock.monotonic() / stage.scene.dt * self._panel.speed) % len(plan)
-            expected = plan[step] if 0 <= step < len(plan) else None
-        lane.show(news.state, prediction=expected, reference=news.reference)
+            predicted = plan[step] if 0 <= step < len(plan) else None
+        lane.show(live.state, prediction=predicted, reference=live.reference)
         self._frames += 1
-        if news.fresh:
-            path = lane.position(np.array(news.path)) if news.path else None
-            miss = lane.trace(path, None if plan is None else lane.position(plan), news.planned)
-            if news.planned:
-                lane.fan(*(news.fan or (None, None)) if "fan" in lane.shown else (None, None))
+        if live.state_is_new:
+            path = lane.position(np.array(live.path)) if live.path else None
+            miss = lane.trace(path, None if plan is None else lane.position(plan), live.plan_is_new)
+            if live.plan_is_new:
+                lane.fan(*(live.fan or (None, None)) if "fan" in lane.visible_ghosts else (None, None))
             if self._mode == "running" or self.offer is None:
-                self._panel.write(f"**Kicking**, {news.time:.2f} s: {100.0 * miss:.1f} cm from the target\n\n{LEGEND}")
-            self._follow(lane.position(news.state))
-        news.fresh = news.planned = False
+                self._panel.write(f"**Kicking**, {live.time:.2f} s: {100.0 * miss:.1f} cm from the target\n\n{LEGEND}")
+            self._follow(lane.position(live.state))
+        live.state_is_new = live.plan_is_new = False
 
     # Cameras and files, each client's own.
 
-    def _welcome(self, client: viser.ClientHandle) -> None:
-        self._look(client, "side")
+    def _connect(self, client: viser.ClientHandle) -> None:
+        self._set_view(client, "side")
 
         # The panel and the size of the window change the aspect of the picture.
         @client.camera.on_update
         async def _(camera: viser.CameraHandle) -> None:
             view, aspect = self._views.get(client.client_id, ("", 1.0))
             if view and abs(aspect_of(camera) / aspect - 1.0) > 0.02:
-                self._look(client, view)
+                self._set_view(client, view)
 
-    def _part(self, client: viser.ClientHandle) -> None:
+    def _disconnect(self, client: viser.ClientHandle) -> None:
         self._views.pop(client.client_id, None)
 
-    def _look(self, client: viser.ClientHandle, view: str) -> None:
+    def _set_view(self, client: viser.ClientHandle, view: str) -> None:
         aspect = aspect_of(client.camera)
         self._views[client.client_id] = view, aspect
-        chosen: View | None = next((each for each in VIEWS if each == view), None)
+        picture_view: View | None = next((name for name in VIEWS if name == view), None)
         with self._lock:
-            if self._stage is None or chosen is None:
+            if self._stage is None or picture_view is None:
                 return
-            camera, stage = self._stage.camera(chosen, aspect), self._stage
+            camera, stage = self._stage.camera(picture_view, aspect), self._stage
         with client.atomic():
-            client.camera.position, client.camera.look_at = camera.place, stage.middle(camera)
+            client.camera.position, client.camera.look_at = camera.position, stage.middle(camera)
 
     def _follow(self, ball: np.ndarray) -> None:
         for number, client in self._server.get_clients().items():
@@ -463,9 +471,9 @@ class LivePage:
     def _download(self, client: viser.ClientHandle, kind: str) -> None:
         """Make a file of the recording that is replayed, in a thread of its own, and send it to one client."""
         recording, files = self._recording, self.files
-        if recording is None or files is None or not self._filing.acquire(blocking=False):
-            why = "Kick first." if recording is None else "Another file is being made."
-            client.add_notification("Not now", why, auto_close_seconds=4.0)
+        if recording is None or files is None or not self._download_lock.acquire(blocking=False):
+            reason = "Kick first." if recording is None else "Another file is being made."
+            client.add_notification("Not now", reason, auto_close_seconds=4.0)
             return
 
         def make() -> None:
@@ -474,7 +482,7 @@ class LivePage:
                 if client.client_id in self._server.get_clients():  # it may have left meanwhile
                     client.send_file_download(name, content, save_immediately=True)
             finally:
-                self._filing.release()
+                self._download_lock.release()
 
         threading.Thread(target=make, daemon=True).start()
 
@@ -484,7 +492,7 @@ def aspect_of(camera: viser.CameraHandle) -> float:
     return within(camera.aspect, 0.2, 5.0)
 
 
-def described(recording: Recording) -> str:
+def summary_text(recording: Recording) -> str:
     """Return the title and the summary of a recording in Markdown."""
     miss = nearest_approach(recording.path, recording.target).distance
     facts = {"nearest to the target": f"{100.0 * miss:.1f} cm", **recording.summary}

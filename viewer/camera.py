@@ -1,4 +1,4 @@
-"""Camera placement: the nearest position from which all given points are visible, along one of a few directions."""
+"""Camera placement: the nearest position from which all points are visible, along one of a few directions."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ MARGIN = 0.4  # m around points that must be visible
 class PictureCamera(NamedTuple):
     """Pinhole camera.
 
-    place: (3,) [m]. axes: (3, 3), right, up and forwards in rows. tangent: of half its horizontal angle of view.
+    position: (3,) [m]. axes: (3, 3), right, up and forwards in rows. tangent: of half its horizontal angle of view.
     """
 
-    place: np.ndarray
+    position: np.ndarray
     axes: np.ndarray
     tangent: float = TANGENT
 
@@ -40,24 +40,24 @@ class PictureCamera(NamedTuple):
         right /= np.linalg.norm(right)
         axes = np.stack([right, np.cross(right, forwards), forwards])
         x, y, depth = (points @ axes.T).T
-        place = np.zeros(3)
+        position = np.zeros(3)
         back = np.inf
-        # A point is in the picture where |x - place| <= tangent (depth - back): two bounds on each side.
+        # A point is in the picture where |x - position| <= tangent (depth - back): two bounds on each side.
         for axis, (across, half) in enumerate(((x, tangent), (y, tangent * aspect))):
             high, low = (across - half * depth).max(), (-across - half * depth).max()
-            place[axis] = 0.5 * (high - low)
+            position[axis] = 0.5 * (high - low)
             back = min(back, -0.5 * (high + low) / half)
-        place[2] = back
-        return cls(place @ axes, axes, tangent)
+        position[2] = back
+        return cls(position @ axes, axes, tangent)
 
     def depth(self, points: np.ndarray) -> np.ndarray:
         """Return the depths [m] of points (*, 3) [m] along the viewing direction."""
-        return np.asarray((points - self.place) @ self.axes[2])
+        return np.asarray((points - self.position) @ self.axes[2])
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Return the projections (*, 2) of points (*, 3) [m]; the width of the picture is from -1 to 1."""
-        seen = (points - self.place) @ self.axes.T
-        return np.asarray(seen[..., :2] / (self.tangent * seen[..., 2:]))
+        in_camera_frame = (points - self.position) @ self.axes.T
+        return np.asarray(in_camera_frame[..., :2] / (self.tangent * in_camera_frame[..., 2:]))
 
     def sphere(self, centre: np.ndarray, radius: float) -> tuple[np.ndarray, float]:
         """Return centre (2,) and radius of a sphere in the picture, as a circle; that it is an ellipse is neglected."""
@@ -65,7 +65,7 @@ class PictureCamera(NamedTuple):
 
 
 def around(*points: np.ndarray) -> np.ndarray:
-    """Return the corners (P, 3) [m] of a cube around each given point, `MARGIN` away from it along each axis."""
+    """Return the corners (P, 3) [m] of a cube around each point, `MARGIN` away from it along each axis."""
     corners = MARGIN * np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    given = np.concatenate([np.reshape(each, (-1, 3)) for each in points])
-    return np.asarray((given[:, None] + corners).reshape(-1, 3))
+    centres = np.concatenate([np.reshape(point_array, (-1, 3)) for point_array in points])
+    return np.asarray((centres[:, None] + corners).reshape(-1, 3))

@@ -27,14 +27,16 @@ def vector(value: object, low: Sequence[float], high: Sequence[float]) -> np.nda
     If the value is not a vector of three, return the corner `low`.
     """
     value = value.tolist() if isinstance(value, np.ndarray) else value
-    parts = value if isinstance(value, tuple | list) and len(value) == len(low) else low
-    bounds = zip(parts, low, high, strict=True)
-    return np.array([within(part, least, most) for part, least, most in bounds])
+    components = value if isinstance(value, tuple | list) and len(value) == len(low) else low
+    bounds = zip(components, low, high, strict=True)
+    return np.array([within(component, lowest, highest) for component, lowest, highest in bounds])
 
 
-def option(value: object, offered: Sequence[T]) -> T:
+def option(value: object, options: Sequence[T]) -> T:
     """Return the offered option that equals the value, in type too, or the first option if none does."""
-    return next((each for each in offered if type(each) is type(value) and each == value), offered[0])
+    return next(
+        (candidate for candidate in options if type(candidate) is type(value) and candidate == value), options[0]
+    )
 
 
 def flag(value: object) -> bool:
@@ -42,7 +44,7 @@ def flag(value: object) -> bool:
     return value is True
 
 
-def alike(value: object, current: object) -> bool:
+def has_type_of(value: object, current: object) -> bool:
     """Return whether a decoded value has the type of a control's current one, be it within its bounds or not.
 
     A number must be finite and exact in JavaScript, a vector as long as the current one. Current values of other types
@@ -58,6 +60,6 @@ def alike(value: object, current: object) -> bool:
         case tuple():
             if not isinstance(value, list) or len(value) != len(current):
                 return False
-            return all(alike(*pair) for pair in zip(value, current, strict=True))
+            return all(has_type_of(*pair) for pair in zip(value, current, strict=True))
         case _:
             return False

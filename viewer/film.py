@@ -24,11 +24,11 @@ from larp_model.files import write_whole
 from larp_model.state import ORIENTATION, POSITION
 from viewer.camera import PictureCamera, around
 from viewer.recording import Approach, Recording, nearest_approach
-from viewer.scene_view import BALL_PATCHES, PREDICTION, TARGET, TRUTH, Colour, football_meshes, link_colour
+from viewer.scene_view import BALL_PATCHES, GROUND_TRUTH, PREDICTION, TARGET, Colour, football_meshes, link_colour
 
 SUFFIXES = (".mp4", ".gif")
 SLOW = 0.25  # playback speed up to the target, as a fraction of real time
-LINGER = 0.1  # s after the closest approach during which playback stays slow
+SLOW_AFTER = 0.1  # s after the closest approach during which playback stays slow
 DOTS = 100  # per inch
 NEAR, FAR = 0.5, 20.0  # m, between which the ground is drawn
 LIGHT = np.array([0.25, -0.45, -1.0])  # direction in which light falls
@@ -53,35 +53,35 @@ def write_film(recording: Recording, path: str | Path, size: tuple[int, int] = (
     check_film(path)
     pictures = frames(recording, size, rate)
     if Path(path).suffix.lower() == ".gif":
-        # Only delays of whole hundredths of a second are kept by all players.
-        delay, stacked = 10 * round(100.0 / rate), np.stack(list(pictures))
-        write_whole(path, imageio.imwrite("<bytes>", stacked, extension=".gif", duration=delay, loop=0))
+        # All players keep only delays of whole hundredths of a second.
+        delay, stack = 10 * round(100.0 / rate), np.stack(list(pictures))
+        write_whole(path, imageio.imwrite("<bytes>", stack, extension=".gif", duration=delay, loop=0))
         return
     from imageio_ffmpeg import get_ffmpeg_exe
 
     # Started here, since the encoder's own start forks, which JAX's threads do not survive.
     with tempfile.TemporaryDirectory() as folder:
         film = Path(folder) / "film.mp4"
-        raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", str(rate), "-i", "-"]
-        line = [
+        raw_format = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", str(rate), "-i", "-"]
+        command = [
             get_ffmpeg_exe(),
             "-loglevel",
             "error",
-            *raw,
+            *raw_format,
             "-pix_fmt",
             "yuv420p",
             "-movflags",
             "+faststart",
             str(film),
         ]
-        subprocess.run(line, input=b"".join(each.tobytes() for each in pictures), check=True)
+        subprocess.run(command, input=b"".join(picture.tobytes() for picture in pictures), check=True)
         write_whole(path, film.read_bytes())
 
 
 def frames(recording: Recording, size: tuple[int, int] = (1280, 720), rate: float = 30.0) -> Iterator[np.ndarray]:
     """Yield the frames (height, width, 3) of a film, with values from 0 to 255."""
     approach = nearest_approach(recording.path, recording.target)
-    camera = PictureCamera.of(_seen(recording, approach), size[1] / size[0])
+    camera = PictureCamera.of(_points_in_view(recording, approach), size[1] / size[0])
     across = size[1] / size[0]
     figure = Figure((size[0] / DOTS, size[1] / DOTS), DOTS, facecolor=SKY)
     canvas = FigureCanvasAgg(figure)
@@ -90,16 +90,16 @@ def frames(recording: Recording, size: tuple[int, int] = (1280, 720), rate: floa
     _ground(axes, camera)
     canvas.draw()
     ground = canvas.copy_from_bbox(figure.bbox)
-    _cleared(axes)
+    _clear(axes)
     for time in _times(recording, approach, rate):
         canvas.restore_region(ground)
         _scene(axes, camera, recording, approach, time)
         axes.draw(canvas.get_renderer())
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
-        _cleared(axes)
+        _clear(axes)
 
 
-def _cleared(axes: Axes) -> None:
+def _clear(axes: Axes) -> None:
     """Remove everything drawn but keep the axes, which take longer to create than a frame."""
     for artist in (*axes.collections, *axes.lines, *axes.patches, *axes.texts):
         artist.remove()
@@ -107,24 +107,24 @@ def _cleared(axes: Axes) -> None:
 
 def _times(recording: Recording, approach: Approach, rate: float) -> Iterator[float]:
     """Yield the times [s] in the recording of the film's frames."""
-    slow = min(approach.row * recording.scene.dt + LINGER, recording.duration)
+    slow = min(approach.row * recording.scene.dt + SLOW_AFTER, recording.duration)
     yield from np.arange(0.0, slow, SLOW / rate)
     yield from np.arange(slow, recording.duration, 1.0 / rate)
 
 
-def _seen(recording: Recording, approach: Approach) -> np.ndarray:
+def _points_in_view(recording: Recording, approach: Approach) -> np.ndarray:
     """Return points (P, 3) [m] that the camera must see: those of the human, and of the ball up to the target."""
     ball = recording.traced % len(recording.scene.links)
     links = np.delete(recording.states[::5], ball, axis=1)[..., POSITION].reshape(-1, 3)
-    way = recording.path[: approach.row + 2]
-    return around(links, way, np.asarray(recording.target, float))
+    ball_path = recording.path[: approach.row + 2]
+    return around(links, ball_path, np.asarray(recording.target, float))
 
 
 def _ground(axes: Axes, camera: PictureCamera) -> None:
     """Draw the ground, a metre grid that fades with distance; it never moves and is drawn only once."""
-    horizon = float(camera(camera.place + 1e4 * (camera.axes[2] * (1.0, 1.0, 0.0)))[1])
+    horizon = float(camera(camera.position + 1e4 * (camera.axes[2] * (1.0, 1.0, 0.0)))[1])
     axes.axhspan(-1.0, horizon, color=GROUND, zorder=0)
-    middle = np.round(camera.place + 0.5 * FAR * camera.axes[2])
+    middle = np.round(camera.position + 0.5 * FAR * camera.axes[2])
     for along, across in ((0, 1), (1, 0)):
         for shift in np.arange(-FAR, FAR + 1.0):
             line = np.zeros((8 * int(FAR), 3))
@@ -145,9 +145,9 @@ def _scene(axes: Axes, camera: PictureCamera, recording: Recording, approach: Ap
     state, traced = recording.states[row], recording.traced % len(recording.scene.links)
     shadows, links = [], []
     for index, link in enumerate(recording.scene.links):
-        turned = Rotation.from_quat(state[index, ORIENTATION], scalar_first=True)
-        reach = 0.5 * link.length * turned.apply(link.axis)
-        ends = state[index, POSITION] + np.stack([reach, -reach])
+        rotation = Rotation.from_quat(state[index, ORIENTATION], scalar_first=True)
+        half_axis = 0.5 * link.length * rotation.apply(link.axis)
+        ends = state[index, POSITION] + np.stack([half_axis, -half_axis])
         shadows.append(_shadow(camera, ends, link.radius))
         if index == traced:
             continue
@@ -158,28 +158,28 @@ def _scene(axes: Axes, camera: PictureCamera, recording: Recording, approach: Ap
     axes.add_collection(PolyCollection(shadows, facecolors=SHADOW, edgecolors="none", zorder=0.2))
     goal, size = camera.sphere(target, recording.radius)
     _disc(axes, goal, size, fc=_rgb(TARGET), alpha=0.35, ec=_rgb(TARGET), lw=1.5, zorder=1)
-    ways: list[tuple[np.ndarray, Colour, Any, float]] = [(recording.path[: row + 1], TRUTH, "-", 2.5)]
+    paths: list[tuple[np.ndarray, Colour, Any, float]] = [(recording.path[: row + 1], GROUND_TRUTH, "-", 2.5)]
     if recording.predicted_path is not None:
-        ways.append((recording.predicted_path, PREDICTION, (0, (4, 3)), 1.6))
-    for way, colour, style, width in ways:
-        seen = way[camera.depth(way) > NEAR]
-        axes.plot(*camera(seen).T, color=_rgb(colour), ls=style, lw=width, zorder=2, solid_capstyle="round")
+        paths.append((recording.predicted_path, PREDICTION, (0, (4, 3)), 1.6))
+    for path, colour, style, width in paths:
+        visible = path[camera.depth(path) > NEAR]
+        axes.plot(*camera(visible).T, color=_rgb(colour), ls=style, lw=width, zorder=2, solid_capstyle="round")
     # The ball is drawn in order of depth: behind links that are nearer to the camera.
-    far = camera.depth(state[traced, POSITION])
-    order = sorted(links, key=lambda each: -each[0])
+    ball_depth = camera.depth(state[traced, POSITION])
+    order = sorted(links, key=lambda entry: -entry[0])
     for layer, (depth, (outline, colour, lit)) in enumerate(order):
-        above = 3.0 + 0.01 * layer + (1.0 if depth < far else 0.0)
-        polygons = PolyCollection([outline], facecolors=[_rgb(colour)], edgecolors="white", lw=0.8, zorder=above)
+        order_z = 3.0 + 0.01 * layer + (1.0 if depth < ball_depth else 0.0)
+        polygons = PolyCollection([outline], facecolors=[_rgb(colour)], edgecolors="white", lw=0.8, zorder=order_z)
         axes.add_collection(polygons)
         shine = tuple(1.0 - 0.78 * (1.0 - part) for part in _rgb(colour))
-        axes.add_collection(PolyCollection([lit], facecolors=[shine], edgecolors="none", zorder=above))
+        axes.add_collection(PolyCollection([lit], facecolors=[shine], edgecolors="none", zorder=order_z))
     _ball(axes, camera, state[traced], recording.radius)
-    expected = recording.predicted_at(row)
-    if expected is not None:
-        middle, size = camera.sphere(expected[traced, POSITION], recording.radius)
+    predicted = recording.predicted_at(row)
+    if predicted is not None:
+        middle, size = camera.sphere(predicted[traced, POSITION], recording.radius)
         _disc(axes, middle, size, fill=False, ec=_rgb(PREDICTION), lw=1.6, ls=(0, (4, 3)), zorder=3.9)
-    passed = row > approach.row
-    if passed:
+    is_past = row > approach.row
+    if is_past:
         ends = camera(np.stack([approach.point, target]))
         axes.plot(*ends.T, color=INK, lw=1.5, zorder=5)
         text = f"{100.0 * approach.distance:.1f} cm from the target"
@@ -193,11 +193,13 @@ def _scene(axes: Axes, camera: PictureCamera, recording: Recording, approach: Ap
             color=INK,
             zorder=6,
         )
-    slow = time < approach.row * dt + LINGER
+    slow = time < approach.row * dt + SLOW_AFTER
     pace = f"{time:.2f} s" + (f", at {SLOW:g} of its speed" if slow else "")
     axes.text(0.025, 0.95, recording.title or "Kick", transform=axes.transAxes, fontsize=17, weight="bold", va="top")
     axes.text(0.025, 0.885, pace, transform=axes.transAxes, fontsize=12, color=QUIET, va="top")
-    for line, (what, colour) in enumerate((("truth (MuJoCo)", TRUTH), ("prediction", PREDICTION), ("target", TARGET))):
+    for line, (what, colour) in enumerate(
+        (("truth (MuJoCo)", GROUND_TRUTH), ("prediction", PREDICTION), ("target", TARGET))
+    ):
         axes.text(
             0.975, 0.95 - 0.045 * line, what, transform=axes.transAxes, fontsize=12, ha="right", va="top",
             color=_rgb(colour),
@@ -210,10 +212,10 @@ def _ball(axes: Axes, camera: PictureCamera, state: np.ndarray, radius: float) -
     middle, size = camera.sphere(centre, radius)
     _disc(axes, middle, size, fc=_rgb(BALL_PATCHES[0]), ec=INK, lw=1.2, zorder=3.8)
     vertices, faces = football_meshes(radius, subdivisions=1)[1]
-    turned = Rotation.from_quat(state[ORIENTATION], scalar_first=True).apply(vertices)
-    towards = camera.place - centre
-    facing = (turned[faces].mean(axis=1) @ towards) > 0.15 * radius * np.linalg.norm(towards)
-    patches = camera(centre + turned)[faces[facing]]
+    rotated = Rotation.from_quat(state[ORIENTATION], scalar_first=True).apply(vertices)
+    towards = camera.position - centre
+    facing = (rotated[faces].mean(axis=1) @ towards) > 0.15 * radius * np.linalg.norm(towards)
+    patches = camera(centre + rotated)[faces[facing]]
     dark = _rgb(BALL_PATCHES[1])
     axes.add_collection(PolyCollection(patches, facecolors=[dark], edgecolors=[dark], lw=0.3, zorder=3.81))
 

@@ -9,7 +9,7 @@ import numpy as np
 import viser
 
 from viewer.checked import vector
-from viewer.wishes import Offer
+from viewer.settings import Offer
 
 SIZE = 0.45  # m, of a handle's arrows
 LEAD = 0.3  # s: an arrow ends where the ball would be after this time
@@ -27,64 +27,64 @@ class Handles:
         offer: Offer,
         target: Sequence[float],
         ball: np.ndarray,
-        changed: Callable[[], None],
+        on_change: Callable[[], None],
     ) -> None:
         """Add the handles to the scene.
 
-        target: (3,) [m], its initial position. ball: (3,) [m], usual position of the ball. changed: see `Panel`.
+        target: (3,) [m], its initial position. ball: (3,) [m], usual position of the ball. on_change: see `Panel`.
         """
-        self._server, self._offer, self._ball, self._changed = server, offer, np.asarray(ball, float), changed
+        self._server, self._offer, self._ball, self._on_change = server, offer, np.asarray(ball, float), on_change
         self.target: tuple[float, ...] = tuple(map(float, target))
         self.spot: tuple[float, ...] = (0.0, 0.0)
         self.roll: tuple[float, ...] = (0.0, 0.0)
-        flat: dict[str, Any] = {"disable_rotations": True, "active_axes": (True, True, False)}
+        flat_style: dict[str, Any] = {"disable_rotations": True, "active_axes": (True, True, False)}
         self._target = self._handle("target", {"disable_rotations": True}, SIZE)
-        self._spot = self._handle("spot", flat, 0.7 * SIZE)
-        self._roll = self._handle("roll", flat, 0.5 * SIZE)
-        self._hint()
-        self._settle()
+        self._spot = self._handle("spot", flat_style, 0.7 * SIZE)
+        self._roll = self._handle("roll", flat_style, 0.5 * SIZE)
+        self._draw_reach()
+        self._place_handles()
 
     def _handle(self, name: str, style: dict[str, Any], size: float) -> viser.TransformControlsHandle:
         handle = self._server.scene.add_transform_controls(f"/handles/{name}", size, depth_test=False, **style)
 
         @handle.on_update
         async def _(event: viser.TransformControlsEvent) -> None:
-            before = self.target, self.spot, self.roll
-            self._take(name, handle.position)
+            old_values = self.target, self.spot, self.roll
+            self._set_value(name, handle.position)
             if event.phase == "end":
-                self._settle()
-            if before != (self.target, self.spot, self.roll):
-                self._changed()
+                self._place_handles()
+            if old_values != (self.target, self.spot, self.roll):
+                self._on_change()
 
         return handle
 
-    def _take(self, name: str, place: np.ndarray) -> None:
+    def _set_value(self, name: str, position: np.ndarray) -> None:
         """Set the value that belongs to a handle from the position (3,) [m] to which it was dragged."""
         offer = self._offer
         if name == "target":
-            self.target = tuple(map(float, vector(place, *offer.target)))
+            self.target = tuple(map(float, vector(position, *offer.target)))
         elif name == "spot":
-            self.spot = self._flat(np.asarray(place) - self._ball, offer.spot)
+            self.spot = self._clip_flat(np.asarray(position) - self._ball, offer.spot)
         else:
-            self.roll = self._flat((np.asarray(place) - self.resting) / LEAD, offer.roll)
-        self._arrow()
+            self.roll = self._clip_flat((np.asarray(position) - self.ball_position) / LEAD, offer.roll)
+        self._draw_arrow()
 
     @staticmethod
-    def _flat(value: np.ndarray, box: tuple[tuple[float, ...], tuple[float, ...]]) -> tuple[float, ...]:
+    def _clip_flat(value: np.ndarray, box: tuple[tuple[float, ...], tuple[float, ...]]) -> tuple[float, ...]:
         return tuple(map(float, vector(value, (*box[0], 0.0), (*box[1], 0.0))[:2]))
 
-    def _settle(self) -> None:
+    def _place_handles(self) -> None:
         """Move the handles to their values: those dragged out of the box that is offered return to its edge."""
-        resting = self.resting
+        ball_position = self.ball_position
         with self._server.atomic():
             self._target.position = np.array(self.target)
-            self._spot.position = resting
-            self._roll.position = resting + LEAD * np.array((*self.roll, 0.0)) + ABOVE
-        self._arrow()
+            self._spot.position = ball_position
+            self._roll.position = ball_position + LEAD * np.array((*self.roll, 0.0)) + ABOVE
+        self._draw_arrow()
 
-    def _arrow(self) -> None:
+    def _draw_arrow(self) -> None:
         """Draw the rolling velocity of the ball as an arrow, or none below 0.1 m/s."""
-        begin = self.resting
+        begin = self.ball_position
         end = begin + LEAD * np.array((*self.roll, 0.0))
         if np.linalg.norm(self.roll) < 0.1:
             self._server.scene.remove_by_name("/handles/rolling")
@@ -92,7 +92,7 @@ class Handles:
             points = np.array([[begin, end]], np.float32)
             self._server.scene.add_arrows("/handles/rolling", points, ROLLING)
 
-    def _hint(self) -> None:
+    def _draw_reach(self) -> None:
         """Draw on the ground the outline of the box that is offered for the target."""
         (low_x, low_y, _), (high_x, high_y, _) = self._offer.target
         corners = np.array([(low_x, low_y), (high_x, low_y), (high_x, high_y), (low_x, high_y)])
@@ -101,20 +101,20 @@ class Handles:
         self._server.scene.add_line_segments("/handles/reach", segments, FAINT, thickness=0.008)
 
     @property
-    def resting(self) -> np.ndarray:
+    def ball_position(self) -> np.ndarray:
         """Return the initial position (3,) [m] of the ball as it is set by its handle."""
         return self._ball + np.array((*self.spot, 0.0))
 
     def aim(self, target: Sequence[float] | np.ndarray) -> None:
         """Move the target to (3,) [m], clipped to the box that is offered, as if it had been dragged."""
-        self._take("target", np.asarray(target, float))
-        self._settle()
+        self._set_value("target", np.asarray(target, float))
+        self._place_handles()
 
-    def shown(self, visible: bool) -> None:
+    def show_all(self, visible: bool) -> None:
         """Show all handles, or only that of the target."""
         for handle in (self._spot, self._roll):
             handle.visible = visible
         if visible:
-            self._arrow()
+            self._draw_arrow()
         else:
             self._server.scene.remove_by_name("/handles/rolling")

@@ -16,7 +16,7 @@ from larp_model.errors import InputError
 from larp_model.files import write_whole
 from larp_model.scene import Scene
 from larp_model.state import SIZE
-from viewer.replay import captioned, played
+from viewer.replay import animation_html, with_caption
 from viewer.scene_view import REFERENCE, SceneView
 from viewer.server import close_server, open_server
 from viewer.stage import ground
@@ -29,8 +29,8 @@ LEGEND = "in colour: executed, grey: kinematic start, red: keypoints, and how fa
 class Overlay:
     """Motions and keypoints that are drawn over each other, in the world frame.
 
-    states, start: (T, L, 13) every `scene.dt`, the executed motion and the kinematic one before physics. seen, found:
-    (F, P, 3) [m] at `rate` frames a second, keypoints on their rays, NaN if there are none, and next to them the points
+    states, start: (T, L, 13) every `scene.dt`, the executed motion and the kinematic one before physics. keypoints,
+    body_points: (F, P, 3) [m] at `rate` frames a second, keypoints on their rays, NaN if there are none, and the points
     of the human that they belong to. camera: its position (3,) and a point (3,) it looks at [m]. field_of_view: from
     top to bottom [rad].
     """
@@ -38,8 +38,8 @@ class Overlay:
     scene: Scene
     states: np.ndarray
     start: np.ndarray
-    seen: np.ndarray
-    found: np.ndarray
+    keypoints: np.ndarray
+    body_points: np.ndarray
     rate: float
     camera: tuple[np.ndarray, np.ndarray]
     field_of_view: float
@@ -51,13 +51,18 @@ class Overlay:
             value = getattr(self, name)
             if np.ndim(value) != 3 or value.shape[1:] != (links, SIZE) or not np.isfinite(value).all():
                 raise InputError(f"{name} has shape {np.shape(value)}, but needs finite (T, {links}, {SIZE})")
-        if np.ndim(self.seen) != 3 or np.shape(self.seen) != np.shape(self.found) or np.shape(self.seen)[2] != 3:
-            raise InputError(f"seen and found have shapes {np.shape(self.seen)} and {np.shape(self.found)}, not one")
+        if (
+            np.ndim(self.keypoints) != 3
+            or np.shape(self.keypoints) != np.shape(self.body_points)
+            or np.shape(self.keypoints)[2] != 3
+        ):
+            shapes = f"{np.shape(self.keypoints)} and {np.shape(self.body_points)}"
+            raise InputError(f"keypoints and body_points have shapes {shapes}, not one")
 
     def at(self, row: int) -> np.ndarray:
         """Return keypoints and their points on the human (K, 2, 3) [m], of the frame nearest to a row of the states."""
-        frame = min(round(row * self.scene.dt * self.rate), len(self.seen) - 1)
-        pairs = np.stack([self.seen[frame], self.found[frame]], axis=1)
+        frame = min(round(row * self.scene.dt * self.rate), len(self.keypoints) - 1)
+        pairs = np.stack([self.keypoints[frame], self.body_points[frame]], axis=1)
         return pairs[np.isfinite(pairs).all(axis=(1, 2))].astype(np.float32)
 
 
@@ -69,11 +74,11 @@ def overlay_page(overlay: Overlay) -> str:
             ground(server)
             human = SceneView(server, scene, "/human")
             start = SceneView(server, scene, "/start", REFERENCE, opacity=0.25)
-            first = overlay.at(0)
+            first_pairs = overlay.at(0)
             points = server.scene.add_point_cloud(
-                "/keypoints", first[:, 0], KEYPOINT, point_size=0.02, point_shape="circle", precision="float32"
+                "/keypoints", first_pairs[:, 0], KEYPOINT, point_size=0.02, point_shape="circle", precision="float32"
             )
-            apart = server.scene.add_line_segments("/apart", first, KEYPOINT, thickness=0.006)
+            lines = server.scene.add_line_segments("/apart", first_pairs, KEYPOINT, thickness=0.006)
         view = server.initial_camera
         view.fov, (view.position, view.look_at) = overlay.field_of_view, overlay.camera
 
@@ -82,12 +87,12 @@ def overlay_page(overlay: Overlay) -> str:
             with server.atomic():
                 human.update(overlay.states[row])
                 start.update(overlay.start[row])
-                points.points, apart.points = pairs[:, 0], pairs
+                points.points, lines.points = pairs[:, 0], pairs
 
-        page = played(server, min(len(overlay.states), len(overlay.start)), scene.dt, show)
+        page = animation_html(server, min(len(overlay.states), len(overlay.start)), scene.dt, show)
     finally:
         close_server(server)
-    return captioned(page, "Motion from keypoints", [*overlay.summary, LEGEND])
+    return with_caption(page, "Motion from keypoints", [*overlay.summary, LEGEND])
 
 
 def write_overlay(overlay: Overlay, path: str | Path) -> None:

@@ -14,7 +14,7 @@ from viser import uplot
 
 from viewer.camera import VIEWS
 from viewer.checked import flag, option, within
-from viewer.wishes import Offer
+from viewer.settings import Offer
 
 SPEEDS = (0.05, 2.0)
 # Actions with a key: name, label of the button, key.
@@ -31,7 +31,7 @@ The ball has two handles: where it lies and, above it, how it rolls.
 
 Thin lines are other candidates, dark ones cheap; grey is the reference."""
 
-Asked = Callable[[str, "viser.ClientHandle | None"], None]
+OnRequest = Callable[[str, "viser.ClientHandle | None"], None]
 
 
 class Panel:
@@ -41,76 +41,76 @@ class Panel:
     """
 
     def __init__(
-        self, gui: viser.GuiApi, asked: Asked, changed: Callable[[], None], offer: Offer | None = None
+        self, gui: viser.GuiApi, on_request: OnRequest, on_change: Callable[[], None], offer: Offer | None = None
     ) -> None:
         """Add the controls to a page.
 
-        asked: called with the name of the action that a client requests, and the client. changed: called when a
+        on_request: called with the name of the action that a client requests, and the client. on_change: called when a
         setting has changed.
         """
-        self._gui, self._asked, self._changed, self._offer = gui, asked, changed, offer
+        self._gui, self._on_request, self._on_change, self._offer = gui, on_request, on_change, offer
         gui.configure_theme(show_share_button=False, show_logo=False)
         gui.set_panel_label("LARP-MPC")
         gui.main_panel.dock_right()
         self._text = gui.add_markdown("Waiting for the first state ...")
-        self._settings: dict[str, Any] = {}
+        self._controls: dict[str, Any] = {}
         self._terms: dict[str, Any] = {}
         self._plots: dict[str, viser.GuiUplotHandle] = {}
         self._duration, self._playing = 0.0, True
         if offer:
-            self._button("Kick", "kick")
-        self._group("", {label: name for name, label, _ in ACTIONS[1 if offer else 2 :]})
+            self._add_button("Kick", "kick")
+        self._add_buttons("", {label: name for name, label, _ in ACTIONS[1 if offer else 2 :]})
         for name, label, key in ACTIONS[0 if offer else 2 :]:
-            self._key(label, name, key)
+            self._add_shortcut(label, name, key)
         self._speed = gui.add_slider("Speed", *SPEEDS, 0.05, 1.0)
         self._time = gui.add_slider("Time [s]", 0.0, 1.0, 0.01, 0.0)
         if offer:
             tabs = gui.add_tab_group()
             with tabs.add_tab("Kick"):
-                self._choices(offer)
+                self._add_settings(offer)
             with tabs.add_tab("Costs"):
-                self._weights(offer)
+                self._add_weights(offer)
             with tabs.add_tab("Kept"):
-                self._kept()
-        self._looks()
+                self._add_saved()
+        self._add_view()
         if offer:
             # Not in a tab: a plot that is created while hidden has no width.
             self._folder = gui.add_folder("Figures")
             with self._folder:
                 self._figures = gui.add_markdown("What kicks come to.")
-        self.watch()
+        self.hide_clock()
 
-    def _button(self, label: str, name: str) -> None:
+    def _add_button(self, label: str, name: str) -> None:
         """Add a button that requests an action by name."""
 
         @self._gui.add_button(label).on_click
         async def _(event: viser.GuiEvent) -> None:
-            self._asked(name, event.client)
+            self._on_request(name, event.client)
 
-    def _group(self, label: str, names: Mapping[str, str]) -> None:
+    def _add_buttons(self, label: str, names: Mapping[str, str]) -> None:
         """Add a row of buttons that request actions. names: from the text on a button to the name of its action."""
         group = self._gui.add_button_group(label, tuple(names))
 
         @group.on_click
         async def _(event: viser.GuiEvent) -> None:
-            self._asked(names[option(group.value, tuple(names))], event.client)
+            self._on_request(names[option(group.value, tuple(names))], event.client)
 
-    def _key(self, label: str, name: str, key: str) -> None:
+    def _add_shortcut(self, label: str, name: str, key: str) -> None:
         """Add a keyboard shortcut that requests an action by name."""
 
         @self._gui.add_command(label, hotkey=key).on_trigger  # type: ignore[arg-type]
         async def _(event: viser.CommandEvent) -> None:
-            self._asked(name, event.client)
+            self._on_request(name, event.client)
 
-    def _setting(self, name: str, handle: Any) -> None:
-        """Register a control by name; whenever it changes, `changed` is called."""
-        self._settings[name] = handle
+    def _add_setting(self, name: str, handle: Any) -> None:
+        """Register a control by name; whenever it changes, `on_change` is called."""
+        self._controls[name] = handle
 
         @handle.on_update
         async def _(event: viser.GuiEvent) -> None:
-            self._changed()
+            self._on_change()
 
-    def _choices(self, offer: Offer) -> None:
+    def _add_settings(self, offer: Offer) -> None:
         gui = self._gui
         gui.add_markdown(ABOUT)
         for name, label, names in (
@@ -119,20 +119,20 @@ class Panel:
             ("weights", "Its weights", offer.weights),
             ("reference", "Reference", offer.references),
         ):
-            self._setting(name, gui.add_dropdown(label, names, visible=len(names) > 1))
+            self._add_setting(name, gui.add_dropdown(label, names, visible=len(names) > 1))
         hint = "Seconds that a plan may take; 0: as long as the preset takes"
-        self._setting("budget", gui.add_slider("Budget [s]", 0.0, offer.longest, 0.05, 0.0, hint=hint))
+        self._add_setting("budget", gui.add_slider("Budget [s]", 0.0, offer.longest, 0.05, 0.0, hint=hint))
         with gui.add_folder("Push", expand_by_default=False):
             gui.add_markdown("While it kicks: a change of velocity [m/s], forwards, to the left, up.")
             self._push = [
                 gui.add_slider(axis, -offer.push, offer.push, 0.1, value)
                 for axis, value in (("forwards", 0.0), ("left", 1.0), ("up", 0.0))
             ]
-            self._group("Push", {"the human": "push human", "the ball": "push ball"})
-        self._key("Push the human", "push human", "H")
-        self._key("Push the ball", "push ball", "B")
+            self._add_buttons("Push", {"the human": "push human", "the ball": "push ball"})
+        self._add_shortcut("Push the human", "push human", "H")
+        self._add_shortcut("Push the ball", "push ball", "B")
 
-    def _weights(self, offer: Offer) -> None:
+    def _add_weights(self, offer: Offer) -> None:
         """Add a slider for the weight of each named cost, with a range relative to its initial weight."""
         self._gui.add_markdown("Weights of the named costs; they count from the next plan on.")
         for name, weight in offer.terms:
@@ -141,32 +141,32 @@ class Panel:
 
             @handle.on_update
             async def _(event: viser.GuiEvent) -> None:
-                self._changed()
+                self._on_change()
 
-        self._button("As they were", "weights")
+        self._add_button("As they were", "weights")
 
-    def _kept(self) -> None:
+    def _add_saved(self) -> None:
         gui = self._gui
-        self._button("Keep this kick", "keep")
+        self._add_button("Keep this kick", "keep")
         self._saved = gui.add_dropdown("Kept kicks", ("none yet",))
-        self._button("Open", "open")
-        self._button("Show beside", "beside")
-        self._button("Take away what is beside", "alone")
+        self._add_button("Open", "open")
+        self._add_button("Show beside", "beside")
+        self._add_button("Take away what is beside", "alone")
 
-    def _looks(self) -> None:
+    def _add_view(self) -> None:
         gui = self._gui
         with gui.add_folder("View", expand_by_default=self._offer is None):
-            self._group("Camera", {name: f"view {name}" for name in (*VIEWS, "follow")})
-            shown = GHOSTS if self._offer else GHOSTS[:2]
-            self._ghosts = {name: gui.add_checkbox(f"show {name}", True) for name in shown}
+            self._add_buttons("Camera", {name: f"view {name}" for name in (*VIEWS, "follow")})
+            ghosts = GHOSTS if self._offer else GHOSTS[:2]
+            self._ghosts = {name: gui.add_checkbox(f"show {name}", True) for name in ghosts}
             for handle in self._ghosts.values():
 
                 @handle.on_update
                 async def _(event: viser.GuiEvent) -> None:
-                    self._asked("look", event.client)
+                    self._on_request("look", event.client)
 
             if self._offer:
-                self._group("Download", {name: f"download {name}" for name in FILES})
+                self._add_buttons("Download", {name: f"download {name}" for name in FILES})
 
     @property
     def playing(self) -> bool:
@@ -174,8 +174,8 @@ class Panel:
         return self._playing
 
     @playing.setter
-    def playing(self, goes_on: bool) -> None:
-        self._playing = goes_on
+    def playing(self, playing: bool) -> None:
+        self._playing = playing
 
     @property
     def speed(self) -> float:
@@ -187,18 +187,22 @@ class Panel:
         """Return the names out of `GHOSTS` that are to be drawn."""
         return {name for name, handle in self._ghosts.items() if flag(handle.value)}
 
-    def asked_for(self) -> dict[str, Any]:
-        """Return the fields of `Wishes` that are set on the panel, all within the offer."""
+    def chosen_settings(self) -> dict[str, Any]:
+        """Return the fields of `Settings` that are set on the panel, all within the offer."""
         offer = self._offer
         assert offer is not None
-        names = {"preset": offer.presets, "dynamics": offer.dynamics}
-        names |= {"weights": offer.weights, "reference": offer.references}
-        found: dict[str, Any] = {name: option(self._settings[name].value, known) for name, known in names.items()}
-        found["budget"] = within(self._settings["budget"].value, 0.0, offer.longest)
-        found["terms"] = {name: within(self._terms[name].value, 0.0, HEAVIEST * weight) for name, weight in offer.terms}
-        return found
+        offered = {"preset": offer.presets, "dynamics": offer.dynamics}
+        offered |= {"weights": offer.weights, "reference": offer.references}
+        chosen: dict[str, Any] = {
+            name: option(self._controls[name].value, options) for name, options in offered.items()
+        }
+        chosen["budget"] = within(self._controls["budget"].value, 0.0, offer.longest)
+        chosen["terms"] = {
+            name: within(self._terms[name].value, 0.0, HEAVIEST * weight) for name, weight in offer.terms
+        }
+        return chosen
 
-    def as_at_first(self) -> None:
+    def reset_weights(self) -> None:
         """Reset the weights of the costs to their initial values."""
         assert self._offer is not None
         for name, weight in self._offer.terms:
@@ -207,13 +211,13 @@ class Panel:
     def push(self) -> tuple[float, ...]:
         """Return the change of velocity (3,) [m/s] set for a push."""
         assert self._offer is not None
-        return tuple(within(each.value, -self._offer.push, self._offer.push) for each in self._push)
+        return tuple(within(slider.value, -self._offer.push, self._offer.push) for slider in self._push)
 
-    def kept(self, names: Sequence[str]) -> None:
+    def list_saved(self, names: Sequence[str]) -> None:
         """Set the names of saved kicks that can be opened, latest first."""
         self._saved.options = tuple(names) or ("none yet",)
 
-    def chosen(self, names: Sequence[str]) -> str | None:
+    def chosen_name(self, names: Sequence[str]) -> str | None:
         """Return the name of the saved kick that is chosen, or None if there are none."""
         return option(self._saved.value, names) if names else None
 
@@ -236,26 +240,27 @@ class Panel:
             return
         # Values that are not finite leave a gap, for they are not small.
         rows = [
-            np.where(np.isfinite(each), np.maximum(each, LEAST), np.nan) for each in map(np.asarray, series.values())
+            np.where(np.isfinite(values), np.maximum(values, LEAST), np.nan)
+            for values in map(np.asarray, series.values())
         ]
         data = (np.arange(1.0, count + 1.0), *rows)
         if name in self._plots:
             self._plots[name].data = data
             return
-        said = [uplot.Series(label=across)]
-        said += [
+        columns = [uplot.Series(label=across)]
+        columns += [
             uplot.Series(label=label, stroke=PALETTE[row % len(PALETTE)], width=2) for row, label in enumerate(series)
         ]
         with self._folder:
             self._plots[name] = self._gui.add_uplot(
                 data,
-                tuple(said),
+                tuple(columns),
                 title=name,
                 scales={"x": uplot.Scale(time=False), "y": uplot.Scale(distr=3)},
                 height=220,
             )
 
-    def watch(self) -> None:
+    def hide_clock(self) -> None:
         """Hide the clock of the replay, which live states do not use."""
         self._time.visible = False
 

@@ -20,7 +20,7 @@ from larp_model.files import write_whole
 from larp_model.scene import Scene
 from larp_model.state import ORIENTATION, POSITION, VELOCITY
 from viewer.recording import Recording, nearest_approach
-from viewer.scene_view import PREDICTION, TARGET, TRUTH, Colour, link_colour
+from viewer.scene_view import GROUND_TRUTH, PREDICTION, TARGET, Colour, link_colour
 
 WIDTH, HEIGHT, DOTS = 18.0, 10.0, 100  # inches, inches, dots per inch
 TILE = 2.1  # m, width of a frame in the strip
@@ -36,15 +36,19 @@ QUIET = "#5b6470"
 
 def kick_picture(recording: Recording, costs: Mapping[str, Sequence[float]] | None, path: str | Path) -> None:
     """Write a PNG of 1800 x 1000 pixels. costs: by name of a cost term, its part of the plan's cost at each replan."""
-    terms = {name: shown for name, values in (costs or {}).items() if not np.isnan(shown := _shown(values)).all()}
+    terms = {
+        name: values
+        for name, raw_values in (costs or {}).items()
+        if not np.isnan(values := _positive(raw_values)).all()
+    }
     figure = Figure((WIDTH, HEIGHT), DOTS, facecolor="white")
     canvas = FigureCanvasAgg(figure)
     miss = nearest_approach(recording.path, recording.target).distance
     facts = {"nearest to the target": f"{100.0 * miss:.1f} cm", **recording.summary}
     figure.text(0.02, 0.955, recording.title or "Kick", fontsize=20, fontweight="bold")
-    said = [f"{name}  {text}" for name, text in facts.items()]
-    for line, begin in enumerate(range(0, len(said), FACTS)):
-        figure.text(0.02, 0.925 - 0.025 * line, "     ".join(said[begin : begin + FACTS]), fontsize=12, color=QUIET)
+    entries = [f"{name}  {text}" for name, text in facts.items()]
+    for line, begin in enumerate(range(0, len(entries), FACTS)):
+        figure.text(0.02, 0.925 - 0.025 * line, "     ".join(entries[begin : begin + FACTS]), fontsize=12, color=QUIET)
     _strip(figure.add_axes((0.02, 0.56, 0.96, 0.35)), recording)
     width = 0.56 if terms else 0.92
     _paths(figure.add_axes((0.05, 0.31, width, 0.2)), figure.add_axes((0.05, 0.06, width, 0.2)), recording)
@@ -61,28 +65,28 @@ def _strip(axes: Axes, recording: Recording) -> None:
     for tile, (row, name) in enumerate(rows.items()):
         state = recording.states[row]
         shift = np.array([TILE * tile - state[0, 0], 0.0])
-        expected, reference = recording.predicted_at(row), recording.reference_at(row)
-        outline = expected if recording.reference is None else reference
+        predicted, reference = recording.predicted_at(row), recording.reference_at(row)
+        outline = predicted if recording.reference is None else reference
         if outline is not None:
             _outline(axes, recording.scene, outline, shift, "#8a93a0")
         _bodies(axes, recording.scene, state, shift, tile)
-        if expected is not None:
-            centre = expected[recording.traced, POSITION][[0, 2]] + shift
+        if predicted is not None:
+            centre = predicted[recording.traced, POSITION][[0, 2]] + shift
             if abs(centre[0] - TILE * tile) < 0.5 * TILE:
                 style = {"fill": False, "ec": _hex(PREDICTION), "lw": 1.5, "ls": "--", "zorder": 4}
                 _disc(axes, centre, recording.radius, **style)
         label = f"{name}  {row * recording.scene.dt:.2f} s".strip()
         axes.text(TILE * tile, -0.12, label, ha="center", va="top", fontsize=12)
     axes.axhline(0.0, color=QUIET, lw=1.0, zorder=0)
-    middle = 0.5 * TILE * (len(rows) - 1)
-    across = max(6, len(rows)) * TILE
-    axes.set_xlim(middle - 0.5 * across, middle + 0.5 * across)
+    centre_x = 0.5 * TILE * (len(rows) - 1)
+    width = max(6, len(rows)) * TILE
+    axes.set_xlim(centre_x - 0.5 * width, centre_x + 0.5 * width)
     axes.set_ylim(-0.35, 2.0)
     axes.set_aspect("equal")
     axes.set_axis_off()
-    shown = [name for name in ("reference", "predicted") if getattr(recording, name) is not None]
-    if shown:
-        label = f"filled: truth   outline: {shown[0]}"
+    outline_names = [name for name in ("reference", "predicted") if getattr(recording, name) is not None]
+    if outline_names:
+        label = f"filled: truth   outline: {outline_names[0]}"
         axes.text(1.0, 1.0, label, transform=axes.transAxes, ha="right", color=QUIET)
 
 
@@ -137,38 +141,38 @@ def _paths(above: Axes, beside: Axes, recording: Recording) -> None:
     above, beside: axes for the sideways offset and for the height.
     """
     start, target = recording.path[0], np.asarray(recording.target, float)
-    ahead = (target - start)[:2]
-    distance = float(np.linalg.norm(ahead))
-    ahead = ahead / distance if distance > 0.0 else np.array([1.0, 0.0])
-    turn = np.array([[ahead[0], ahead[1], 0.0], [-ahead[1], ahead[0], 0.0], [0.0, 0.0, 1.0]])
+    direction = (target - start)[:2]
+    distance = float(np.linalg.norm(direction))
+    direction = direction / distance if distance > 0.0 else np.array([1.0, 0.0])
+    rotation = np.array([[direction[0], direction[1], 0.0], [-direction[1], direction[0], 0.0], [0.0, 0.0, 1.0]])
 
     def view(points: np.ndarray) -> np.ndarray:
-        return (points - [start[0], start[1], 0.0]) @ turn.T
+        return (points - [start[0], start[1], 0.0]) @ rotation.T
 
     approach = nearest_approach(recording.path, target)
-    truth, nearest, goal = view(recording.path), view(approach.point), view(target)
-    seen = truth[: approach.row + 2]
-    expected = None if recording.predicted_path is None else view(recording.predicted_path)
-    low = np.min([seen.min(axis=0), goal, [0.0, -0.3, 0.0]], axis=0) - np.array([0.5, 0.1, 0.15])
-    high = np.max([seen.max(axis=0), goal, [0.0, 0.3, 0.4]], axis=0) + np.array([0.8, 0.1, 0.25])
+    path, nearest, goal = view(recording.path), view(approach.point), view(target)
+    drawn = path[: approach.row + 2]
+    predicted = None if recording.predicted_path is None else view(recording.predicted_path)
+    low = np.min([drawn.min(axis=0), goal, [0.0, -0.3, 0.0]], axis=0) - np.array([0.5, 0.1, 0.15])
+    high = np.max([drawn.max(axis=0), goal, [0.0, 0.3, 0.4]], axis=0) + np.array([0.8, 0.1, 0.25])
     width, height = above.get_position().width * WIDTH, above.get_position().height * HEIGHT
     scale = max((high[0] - low[0]) / width, (high[1:] - low[1:]).max() / height)  # m per inch
     for axes, row in ((above, 1), (beside, 2)):
         planes = [0, row]
-        axes.plot(*truth[:, planes].T, color=_hex(TRUTH), lw=2.5, label="truth")
-        if expected is not None:
-            axes.plot(*expected[:, planes].T, color=_hex(PREDICTION), lw=2.0, ls="--", label="prediction")
+        axes.plot(*path[:, planes].T, color=_hex(GROUND_TRUTH), lw=2.5, label="truth")
+        if predicted is not None:
+            axes.plot(*predicted[:, planes].T, color=_hex(PREDICTION), lw=2.0, ls="--", label="prediction")
         _disc(axes, goal[planes], recording.radius, color=_hex(TARGET), alpha=0.5, lw=0, label="target")
-        for point in (truth[0], nearest):
-            _disc(axes, point[planes], recording.radius, fill=False, ec=_hex(TRUTH), lw=1.2)
+        for point in (path[0], nearest):
+            _disc(axes, point[planes], recording.radius, fill=False, ec=_hex(GROUND_TRUTH), lw=1.2)
         axes.plot(*np.stack([nearest, goal])[:, planes].T, color="black", lw=1.2)
         bottom = low[2] if row == 2 else 0.5 * (low[1] + high[1] - scale * height)
         # Away from the path, and from the title above.
-        down = nearest[row] >= goal[row] or goal[row] > bottom + 0.7 * scale * height
+        label_below = nearest[row] >= goal[row] or goal[row] > bottom + 0.7 * scale * height
         axes.annotate(
             f"misses by {100.0 * approach.distance:.1f} cm",
             (goal[0], goal[row]),
-            xytext=(18.0, -34.0 if down else 26.0),
+            xytext=(18.0, -34.0 if label_below else 26.0),
             textcoords="offset points",
             fontsize=12,
             arrowprops={"arrowstyle": "-", "color": QUIET, "lw": 0.8},
@@ -186,17 +190,17 @@ def _paths(above: Axes, beside: Axes, recording: Recording) -> None:
     above.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False, fontsize=11)
 
 
-def _shown(values: Sequence[float]) -> np.ndarray:
+def _positive(values: Sequence[float]) -> np.ndarray:
     """Return costs, with NaN for those not positive or not finite, which a logarithmic axis cannot show."""
-    given = np.asarray(values, float)
-    return np.where((given > 0.0) & np.isfinite(given), given, np.nan)
+    costs = np.asarray(values, float)
+    return np.where((costs > 0.0) & np.isfinite(costs), costs, np.nan)
 
 
 def _costs(axes: Axes, terms: Mapping[str, np.ndarray]) -> None:
-    """Plot the cost terms, as `_shown` returns them, over the replans."""
-    for (name, shown), colour, marker in zip(terms.items(), cycle(PALETTE), cycle("osD^vP"), strict=False):
-        axes.plot(np.arange(1, len(shown) + 1), shown, color=colour, marker=marker, ms=4, lw=1.5, label=name)
-    greatest = max(float(np.nanmax(shown)) for shown in terms.values())
+    """Plot the cost terms, as `_positive` returns them, over the replans."""
+    for (name, values), colour, marker in zip(terms.items(), cycle(PALETTE), cycle("osD^vP"), strict=False):
+        axes.plot(np.arange(1, len(values) + 1), values, color=colour, marker=marker, ms=4, lw=1.5, label=name)
+    greatest = max(float(np.nanmax(values)) for values in terms.values())
     axes.set_yscale("log")
     axes.set_ylim(max(axes.get_ylim()[0], greatest * 10.0**-DECADES), None)
     axes.set_xlim(0.5, max(map(len, terms.values())) + 0.5)

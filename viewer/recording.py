@@ -32,17 +32,17 @@ def nearest_approach(path: np.ndarray, target: np.ndarray) -> Approach:
     return Approach(float(np.linalg.norm(point - target)), point, int(row))
 
 
-def known(predicted: np.ndarray, traced: int = -1) -> np.ndarray:
+def mask_unpredicted(predicted: np.ndarray, traced: int = -1) -> np.ndarray:
     """Return states (T, L, 13), NaN for links but the traced after the last row in which any of these links moves.
 
     Beyond that row their states were not predicted: they only repeat the last ones.
     """
-    found = np.array(predicted, float)
-    others = np.arange(found.shape[1]) != traced % found.shape[1]
-    moves = (found[1:, others] != found[:-1, others]).any(axis=(1, 2))
-    last = int(moves.nonzero()[0][-1]) + 1 if moves.any() else len(found) - 1
-    found[last + 1 :, others] = np.nan
-    return found
+    states = np.array(predicted, float)
+    others = np.arange(states.shape[1]) != traced % states.shape[1]
+    any_moves = (states[1:, others] != states[:-1, others]).any(axis=(1, 2))
+    last_row = int(any_moves.nonzero()[0][-1]) + 1 if any_moves.any() else len(states) - 1
+    states[last_row + 1 :, others] = np.nan
+    return states
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,8 +107,8 @@ class Recording:
         return self.scene.links[self.traced].radius
 
     @cached_property
-    def _known(self) -> np.ndarray | None:
-        return None if self.predicted is None else known(self.predicted, self.traced)
+    def _masked(self) -> np.ndarray | None:
+        return None if self.predicted is None else mask_unpredicted(self.predicted, self.traced)
 
     def predicted_at(self, row: int) -> np.ndarray | None:
         """Return the state (L, 13) predicted for a row of the ground truth, or None.
@@ -116,9 +116,9 @@ class Recording:
         It is NaN for links that were not predicted so far ahead.
         """
         index = row - self.predicted_start
-        if self._known is None or not 0 <= index < len(self._known):
+        if self._masked is None or not 0 <= index < len(self._masked):
             return None
-        return np.asarray(self._known[index])
+        return np.asarray(self._masked[index])
 
     def reference_at(self, row: int) -> np.ndarray | None:
         """Return the reference's state (L, 13) at a row of the ground truth, or None beyond its end."""

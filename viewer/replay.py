@@ -11,7 +11,7 @@ import viser
 from larp_model.files import write_whole
 from viewer.recording import Recording
 from viewer.server import close_server, open_server
-from viewer.stage import LEGEND, Stage, whole
+from viewer.stage import LEGEND, Stage, points_in_view
 
 FRAME = 0.02  # s of recorded time between two frames
 
@@ -34,7 +34,7 @@ def page_of(recording: Recording) -> str:
     server = open_server(port=0)
     try:
         stage = Stage(server, recording.scene, recording.target, recording.traced)
-        stage.frame(whole(recording))
+        stage.frame(points_in_view(recording))
         miss = stage.lane.trace(recording.path, recording.predicted_path)
 
         def show(row: int) -> None:
@@ -42,26 +42,28 @@ def page_of(recording: Recording) -> str:
                 recording.states[row], prediction=recording.predicted_at(row), reference=recording.reference_at(row)
             )
 
-        page = played(server, len(recording.states), recording.scene.dt, show)
+        page = animation_html(server, len(recording.states), recording.scene.dt, show)
     finally:
         close_server(server)
     facts = {"nearest to the target": f"{100.0 * miss:.1f} cm", **recording.summary}
-    return captioned(page, recording.title or "Replay", [*(f"{name}: {text}" for name, text in facts.items()), LEGEND])
+    return with_caption(
+        page, recording.title or "Replay", [*(f"{name}: {text}" for name, text in facts.items()), LEGEND]
+    )
 
 
-def played(server: viser.ViserServer, rows: int, dt: float, show: Callable[[int], None]) -> str:
+def animation_html(server: viser.ViserServer, rows: int, dt: float, show: Callable[[int], None]) -> str:
     """Return HTML that plays a server's scene, set by `show` for every n-th row of a motion with a row per `dt` [s].
 
     n is such that frames are about `FRAME` apart.
     """
-    film, stride = server.get_scene_serializer(), max(1, round(FRAME / dt))
+    serializer, stride = server.get_scene_serializer(), max(1, round(FRAME / dt))
     for row in range(0, rows, stride):
         show(row)
-        film.insert_sleep(stride * dt)
-    return film.as_html()
+        serializer.insert_sleep(stride * dt)
+    return serializer.as_html()
 
 
-def captioned(page: str, title: str, lines: list[str]) -> str:
+def with_caption(page: str, title: str, lines: list[str]) -> str:
     """Return the page with a title, and with the title and these lines in a corner."""
     title = escape(title)
     caption = "<br>".join([f"<b>{title}</b>", *map(escape, lines)])

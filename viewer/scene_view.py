@@ -21,7 +21,7 @@ Mesh = tuple[np.ndarray, np.ndarray]  # vertices (V, 3) [m], faces (F, 3)
 TRUNK, LEFT, RIGHT = (92, 107, 133), (112, 178, 217), (233, 160, 60)
 BALL_PATCHES = ((246, 246, 243), (38, 40, 46))  # hexagons, pentagons
 # Okabe and Ito's, safe for all eyes.
-TRUTH, PREDICTION, TARGET, REFERENCE = (213, 94, 0), (0, 114, 178), (0, 158, 115), (110, 116, 126)
+GROUND_TRUTH, PREDICTION, TARGET, REFERENCE = (213, 94, 0), (0, 114, 178), (0, 158, 115), (110, 116, 126)
 
 
 def link_colour(link: Link) -> Colour:
@@ -46,7 +46,7 @@ def unit_meshes(sides: int = 24) -> tuple[Mesh, Mesh]:
     """
     ball = uv_sphere(1.0, count=(sides // 2, sides))
     tube = revolve(np.array([(1.0, -0.5), (1.0, 0.5)]), sections=sides)
-    as_mesh = [(each.vertices.astype(np.float32), each.faces.astype(np.uint32)) for each in (ball, tube)]
+    as_mesh = [(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)) for mesh in (ball, tube)]
     return as_mesh[0], as_mesh[1]
 
 
@@ -57,26 +57,30 @@ def football_meshes(radius: float, subdivisions: int = 3) -> tuple[Mesh, Mesh]:
     It is a truncated icosahedron, its faces subdivided and projected on the sphere.
     """
     golden = 0.5 * (1.0 + 5.0**0.5)
-    tips = [np.roll((0.0, y, z), turn) for y in (-1.0, 1.0) for z in (-golden, golden) for turn in range(3)]
+    vertices = [np.roll((0.0, y, z), turn) for y in (-1.0, 1.0) for z in (-golden, golden) for turn in range(3)]
     hexagons, pentagons = [], []
-    for a, b, c in combinations(tips, 3):
+    for a, b, c in combinations(vertices, 3):
         if max(np.linalg.norm(p - q) for p, q in combinations((a, b, c), 2)) > 2.1:
             continue  # no face of the icosahedron, whose edges have length 2
         if np.linalg.det([a, b, c]) < 0.0:
             b, c = c, b
-        rim = [(2.0 * p + q) / 3.0 for p, q in ((a, b), (b, a), (b, c), (c, b), (c, a), (a, c))]
+        edge_points = [(2.0 * p + q) / 3.0 for p, q in ((a, b), (b, a), (b, c), (c, b), (c, a), (a, c))]
         centre = (a + b + c) / 3.0
-        hexagons += [(centre, rim[i - 1], rim[i]) for i in range(6)]
-        pentagons += [(a, rim[0], rim[5]), (b, rim[2], rim[1]), (c, rim[4], rim[3])]
+        hexagons += [(centre, edge_points[i - 1], edge_points[i]) for i in range(6)]
+        pentagons += [
+            (a, edge_points[0], edge_points[5]),
+            (b, edge_points[2], edge_points[1]),
+            (c, edge_points[4], edge_points[3]),
+        ]
 
     def sphere(triangles: Sequence[Sequence[np.ndarray]]) -> Mesh:
-        parts = np.array(triangles)
+        pieces = np.array(triangles)
         for _ in range(subdivisions):
-            a, b, c = parts[:, 0], parts[:, 1], parts[:, 2]
+            a, b, c = pieces[:, 0], pieces[:, 1], pieces[:, 2]
             ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
             corners = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
-            parts = np.concatenate([np.stack(corner, axis=1) for corner in corners])
-        return weld(radius * parts / np.linalg.norm(parts, axis=-1, keepdims=True))
+            pieces = np.concatenate([np.stack(corner, axis=1) for corner in corners])
+        return weld(radius * pieces / np.linalg.norm(pieces, axis=-1, keepdims=True))
 
     return sphere(hexagons), sphere(pentagons)
 
@@ -117,24 +121,24 @@ class Capsules:
                 cast_shadow=opacity is None,
             )
 
-        (ball, tube), painted = unit_meshes(), np.array(colours, np.uint8)
-        self.ends = batch("ends", ball, np.tile(radii, 2), np.tile(painted, (2, 1)))
-        self.tubes = batch("tubes", tube, self._sizes, painted)
-        self._known = np.ones(len(links), bool)
+        (ball, tube), colour_array = unit_meshes(), np.array(colours, np.uint8)
+        self.ends = batch("ends", ball, np.tile(radii, 2), np.tile(colour_array, (2, 1)))
+        self.tubes = batch("tubes", tube, self._sizes, colour_array)
+        self._is_known = np.ones(len(links), bool)
 
     def move(self, state: np.ndarray) -> None:
-        """Move the links to a state (n, 13); those whose state is not known (NaN) shrink to nothing."""
-        known = np.isfinite(state).all(axis=1)
-        state = np.where(known[:, None], state, np.arange(SIZE) == ORIENTATION.start)
-        place, turned = state[:, POSITION], Rotation.from_quat(state[:, ORIENTATION], scalar_first=True)
-        to_end = turned.apply(self._to_end)
-        self.ends.batched_positions = np.concatenate([place - to_end, place + to_end])
-        self.tubes.batched_positions = place
-        self.tubes.batched_wxyzs = (turned * self._along).as_quat(scalar_first=True)
-        if not np.array_equal(known, self._known):
-            self.ends.batched_scales = np.tile(known * self._sizes[:, 0], 2)
-            self.tubes.batched_scales = known[:, None] * self._sizes
-            self._known = known
+        """Move the links to a state (n, 13); those without a known state (NaN) shrink to nothing."""
+        is_known = np.isfinite(state).all(axis=1)
+        state = np.where(is_known[:, None], state, np.arange(SIZE) == ORIENTATION.start)
+        position, rotation = state[:, POSITION], Rotation.from_quat(state[:, ORIENTATION], scalar_first=True)
+        to_end = rotation.apply(self._to_end)
+        self.ends.batched_positions = np.concatenate([position - to_end, position + to_end])
+        self.tubes.batched_positions = position
+        self.tubes.batched_wxyzs = (rotation * self._along).as_quat(scalar_first=True)
+        if not np.array_equal(is_known, self._is_known):
+            self.ends.batched_scales = np.tile(is_known * self._sizes[:, 0], 2)
+            self.tubes.batched_scales = is_known[:, None] * self._sizes
+            self._is_known = is_known
 
 
 class SceneView:
@@ -157,13 +161,15 @@ class SceneView:
         self._balls = {}
         for body in scene.bodies:
             if body.is_ball:
-                place, radius = f"{name}/{body.name}", body.links[0].radius
-                self._balls[scene.rows(body.name).start] = server.scene.add_frame(place, show_axes=False)
+                node, radius = f"{name}/{body.name}", body.links[0].radius
+                self._balls[scene.rows(body.name).start] = server.scene.add_frame(node, show_axes=False)
                 vertices, faces = unit_meshes()[0]
                 meshes = ((radius * vertices, faces),) if colour else football_meshes(radius)
-                for part, (mesh, own) in enumerate(zip(meshes, (colour,) if colour else BALL_PATCHES, strict=True)):
+                for part, (mesh, part_colour) in enumerate(
+                    zip(meshes, (colour,) if colour else BALL_PATCHES, strict=True)
+                ):
                     server.scene.add_mesh_simple(
-                        f"{place}/{part}", *mesh, color=own, opacity=opacity, cast_shadow=opacity is None
+                        f"{node}/{part}", *mesh, color=part_colour, opacity=opacity, cast_shadow=opacity is None
                     )
         self._rows = np.array([row for row in range(self._links) if row not in self._balls], int)
         links = [scene.links[row] for row in self._rows]
@@ -171,7 +177,7 @@ class SceneView:
         self.capsules = Capsules(server, links, f"{name}/capsules", colours, opacity) if links else None
 
     def update(self, state: np.ndarray | None) -> None:
-        """Move the links to a state (L, 13); hide those whose state is not known (NaN), or all if it is None."""
+        """Move the links to a state (L, 13); hide those without a known state (NaN), or all if it is None."""
         if state is not None and np.shape(state) != (self._links, SIZE):
             raise InputError(f"state has shape {np.shape(state)}, but needs ({self._links}, {SIZE})")
         with self._server.atomic():

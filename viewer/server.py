@@ -24,7 +24,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from larp_model.errors import InputError
-from viewer.checked import alike
+from viewer.checked import has_type_of
 
 RESOLVING = 1.5  # s until a host's name must be resolved
 PATIENCE = 0.5  # s for clients to acknowledge that the server closes
@@ -56,8 +56,8 @@ _NAME = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)*")
 
 def require_address(host: str, port: int, allowed: Sequence[str] = ()) -> None:
     """Raise InputError if `open_server` would; the address is opened for a moment only."""
-    _checked_names(allowed)
-    _listening(host, port).close()
+    _check_names(allowed)
+    _listen(host, port).close()
 
 
 def open_server(host: str = "127.0.0.1", port: int = 8080, allowed: Sequence[str] = ()) -> viser.ViserServer:
@@ -68,8 +68,8 @@ def open_server(host: str = "127.0.0.1", port: int = 8080, allowed: Sequence[str
     machines can reach, a warning is printed on stderr. Raises InputError if the address cannot be opened: Viser itself
     would move to another port, or try for ever.
     """
-    proxies = _checked_names(allowed)
-    listening = _listening(host, port)
+    proxies = _check_names(allowed)
+    listening = _listen(host, port)
     local = is_loopback(listening.getsockname()[0])
     try:
         with redirect_stdout(io.StringIO()):
@@ -103,8 +103,8 @@ def names_of(host: str, local: bool) -> frozenset[str]:
 
     Ports are left out, for forwarding changes them.
     """
-    here = ("127.0.0.1", "[::1]") if local else (socket.gethostname(),)
-    return frozenset(name.lower() for name in ("localhost", _bracketed(host), *here))
+    machine_names = ("127.0.0.1", "[::1]") if local else (socket.gethostname(),)
+    return frozenset(name.lower() for name in ("localhost", _bracketed(host), *machine_names))
 
 
 def admits(headers: Headers, names: frozenset[str], addresses: bool, proxies: frozenset[str] = frozenset()) -> bool:
@@ -116,13 +116,13 @@ def admits(headers: Headers, names: frozenset[str], addresses: bool, proxies: fr
     that site and then to this server; that name is not among the accepted ones.
     """
     hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
-    asked = _HOST.fullmatch(hosts[0].lower()) if len(hosts) == 1 else None
-    if asked is None or not (asked[1] in names | proxies or (addresses and _is_address(asked[1]))):
+    host = _HOST.fullmatch(hosts[0].lower()) if len(hosts) == 1 else None
+    if host is None or not (host[1] in names | proxies or (addresses and _is_address(host[1]))):
         return False
     if not origins:
         return True
     origin = _ORIGIN.fullmatch(origins[0].lower()) if len(origins) == 1 else None
-    return origin is not None and (origin[1] == asked[0] or origin[2] in proxies)
+    return origin is not None and (origin[1] == host[0] or origin[2] in proxies)
 
 
 def is_sound(raw: str | bytes) -> bool:
@@ -136,7 +136,7 @@ def is_sound(raw: str | bytes) -> bool:
     except (msgspec.DecodeError, RecursionError, UnicodeError):
         return True
     return not isinstance(message, dict) or all(
-        alike(message[name], pattern) for name, pattern in FIELDS.items() if name in message
+        has_type_of(message[name], pattern) for name, pattern in FIELDS.items() if name in message
     )
 
 
@@ -161,11 +161,11 @@ class _Server(viser.ViserServer):
         host. proxies: see `admits`.
         """
         names = names_of(host, local)
-        self._served: listener.serve | None = None
+        self._websocket_serve: listener.serve | None = None
         with _STARTING:
             serve = listener.serve
 
-            def guarded(handler: Any, *address: Any, **options: Any) -> listener.serve:
+            def checked_serve(handler: Any, *address: Any, **options: Any) -> listener.serve:
                 viser_server = vars(self).get("_websock_server")
                 if viser_server is None or viser_server._server_thread is not threading.current_thread():
                     return serve(handler, *address, **options)  # for someone else in this process
@@ -173,15 +173,15 @@ class _Server(viser.ViserServer):
                 options["create_connection"] = _Connection
                 options["max_size"] = LARGEST_MESSAGE
                 options["logger"] = logging.Logger("viewer", logging.CRITICAL)  # or strangers write to our terminal
-                self._served = serve(handler, sock=listening, **options)
-                return self._served
+                self._websocket_serve = serve(handler, sock=listening, **options)
+                return self._websocket_serve
 
-            listener.serve = guarded  # type: ignore[assignment,misc]
+            listener.serve = checked_serve  # type: ignore[assignment,misc]
             try:
                 super().__init__(host, listening.getsockname()[1], verbose=False)
             finally:
                 listener.serve = serve  # type: ignore[misc]
-        if self._served is None:
+        if self._websocket_serve is None:
             self.stop()
             raise RuntimeError(f"Viser {viser.__version__} opens its server in a way that cannot be guarded")
         for kind in REFUSED:
@@ -191,8 +191,8 @@ class _Server(viser.ViserServer):
 
     def stop(self) -> None:
         """Close all connections and end all threads; clients that do not respond are cut off."""
-        if self._served is not None:
-            loop = self._served.server.loop
+        if self._websocket_serve is not None:
+            loop = self._websocket_serve.server.loop
             with suppress(RuntimeError):  # it is closed already
                 loop.call_soon_threadsafe(loop.call_later, PATIENCE, self._cut_off)
         super().stop()
@@ -204,8 +204,8 @@ class _Server(viser.ViserServer):
         """Do nothing: there is no public address to give up."""
 
     def _cut_off(self) -> None:
-        assert self._served is not None
-        for connection in tuple(self._served.server.handlers):
+        assert self._websocket_serve is not None
+        for connection in tuple(self._websocket_serve.server.handlers):
             connection.transport.abort()
 
     async def _change(self, client: Any, message: messages.GuiUpdateMessage) -> None:
@@ -216,24 +216,26 @@ class _Server(viser.ViserServer):
         control = self.gui._gui_input_handle_from_uuid.get(message.uuid)
         if control is None or not isinstance(message.updates, dict) or [*message.updates] != ["value"]:
             return
-        if alike(message.updates["value"], control.value):
+        if has_type_of(message.updates["value"], control.value):
             await self.gui._handle_gui_updates(client, message)
 
 
-Answer = Callable[[ServerConnection, Request], Response | None]
+ProcessRequest = Callable[[ServerConnection, Request], Response | None]
 
 
-def _guard(answer: Answer, names: frozenset[str], addresses: bool, proxies: frozenset[str]) -> Answer:
-    def guarded(connection: ServerConnection, request: Request) -> Response | None:
+def _guard(
+    process_request: ProcessRequest, names: frozenset[str], addresses: bool, proxies: frozenset[str]
+) -> ProcessRequest:
+    def checked_process_request(connection: ServerConnection, request: Request) -> Response | None:
         if admits(request.headers, names, addresses, proxies):
-            return answer(connection, request)
+            return process_request(connection, request)
         refusal = "This page is served only under its own address; --allow-host NAME admits a proxy's.\n"
         return connection.respond(HTTPStatus.FORBIDDEN, refusal)
 
-    return guarded
+    return checked_process_request
 
 
-def _checked_names(allowed: Sequence[str]) -> frozenset[str]:
+def _check_names(allowed: Sequence[str]) -> frozenset[str]:
     """Return host names in lower case; raise InputError for anything else, such as one with a port, or a URL."""
     for name in allowed:
         if not _NAME.fullmatch(name.lower()):
@@ -241,12 +243,12 @@ def _checked_names(allowed: Sequence[str]) -> frozenset[str]:
     return frozenset(name.lower() for name in allowed)
 
 
-def _listening(host: str, port: int) -> socket.socket:
+def _listen(host: str, port: int) -> socket.socket:
     """Return a socket that already listens at the address, so that nobody can take its port between check and use."""
     if not isinstance(port, int) or not 0 <= port < 2**16:
         raise InputError(f"port is {port!r}, but must be an integer in [0, 65536)")
     try:
-        family, address = _resolved(host, port)
+        family, address = _resolve(host, port)
         return socket.create_server(address, family=family)
     except OSError as error:
         if error.errno in (EACCES, EADDRINUSE):
@@ -254,22 +256,22 @@ def _listening(host: str, port: int) -> socket.socket:
         raise InputError(f"host is {host!r}, but must be an address or a name of this machine: {error}") from None
 
 
-def _resolved(host: str, port: int) -> tuple[socket.AddressFamily, Any]:
+def _resolve(host: str, port: int) -> tuple[socket.AddressFamily, Any]:
     """Return family and address of a host, IPv4 if there is one. Raises OSError, also if resolving takes too long."""
-    found: list[Any] = []
+    results: list[Any] = []
 
-    def look() -> None:
+    def resolve() -> None:
         try:
-            found.extend(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM) if host else ())
+            results.extend(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM) if host else ())
         except (OSError, ValueError) as error:  # a name can also be malformed
-            found.append(error)
+            results.append(error)
 
-    looking = threading.Thread(target=look, daemon=True)
-    looking.start()
-    looking.join(RESOLVING)
-    if not found or isinstance(found[0], Exception):
-        raise OSError(found[0] if found else "nobody knows it")
-    family, _, _, _, address = min(found, key=lambda each: each[0] != socket.AF_INET)
+    thread = threading.Thread(target=resolve, daemon=True)
+    thread.start()
+    thread.join(RESOLVING)
+    if not results or isinstance(results[0], Exception):
+        raise OSError(results[0] if results else "nobody knows it")
+    family, _, _, _, address = min(results, key=lambda result: result[0] != socket.AF_INET)
     return family, address
 
 

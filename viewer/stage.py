@@ -10,7 +10,7 @@ from larp_model.scene import Scene
 from larp_model.state import POSITION
 from viewer.camera import PictureCamera, View, around
 from viewer.recording import Recording, nearest_approach
-from viewer.scene_view import PREDICTION, REFERENCE, TARGET, TRUTH, Colour, SceneView
+from viewer.scene_view import GROUND_TRUTH, PREDICTION, REFERENCE, TARGET, Colour, SceneView
 
 LEGEND = "orange: truth, blue: prediction, green: target"
 GROUND, LINES, POSTS = (233, 238, 234), (190, 202, 194), (250, 250, 250)
@@ -38,7 +38,7 @@ class Lane:
             f"{name}/target", self._radius, TARGET, opacity=0.45, cast_shadow=False, receive_shadow=False
         )
         self._label = server.scene.add_label(f"{name}/nearest", "", anchor="bottom-center", visible=False)
-        self._truth = SceneView(server, scene, f"{name}/truth")
+        self._ground_truth = SceneView(server, scene, f"{name}/truth")
         self._ghosts = {
             "prediction": SceneView(server, scene, f"{name}/prediction", PREDICTION, opacity=0.35),
             "reference": SceneView(server, scene, f"{name}/reference", REFERENCE, opacity=0.18),
@@ -46,7 +46,7 @@ class Lane:
         for ghost in self._ghosts.values():
             ghost.update(None)
         self._lines = dict[str, viser.LineSegmentsHandle]()
-        self.shown = set(self._ghosts)
+        self.visible_ghosts = set(self._ghosts)
         self.aim(target)
 
     def aim(self, target: np.ndarray) -> None:
@@ -58,12 +58,12 @@ class Lane:
     def show(self, state: np.ndarray, **ghosts: np.ndarray | None) -> None:
         """Move the ground truth to a state (L, 13) and each ghost to its own, or hide it; the reference has no ball."""
         if (reference := ghosts.get("reference")) is not None:
-            ghosts["reference"] = alone = np.array(reference)
-            alone[self._traced] = np.nan
+            ghosts["reference"] = without_ball = np.array(reference)
+            without_ball[self._traced] = np.nan
         with self._server.atomic():
-            self._truth.update(state)
+            self._ground_truth.update(state)
             for name, ghost in self._ghosts.items():
-                ghost.update(ghosts.get(name) if name in self.shown else None)
+                ghost.update(ghosts.get(name) if name in self.visible_ghosts else None)
 
     def trace(self, path: np.ndarray | None, expected: np.ndarray | None = None, new: bool = True) -> float:
         """Draw the paths (T, 3) of the ground truth and (T', 3) of the prediction [m]; None: there is none.
@@ -74,33 +74,37 @@ class Lane:
         the predicted one; inf without a path. A label at the target shows it in cm.
         """
         with self._server.atomic():
-            self._line("truth", path, TRUTH, 0.025)
+            self._line("truth", path, GROUND_TRUTH, 0.025)
             if new:
                 self._line("expected", expected, PREDICTION, 0.015)
-            ways = {kind: way for kind, way in (("", path), (" expected", expected)) if way is not None}
-            found = {kind: nearest_approach(way, self.target) for kind, way in ways.items()}
-            if not found:
+            paths = {
+                kind: kind_path for kind, kind_path in (("", path), (" expected", expected)) if kind_path is not None
+            }
+            approaches = {kind: nearest_approach(kind_path, self.target) for kind, kind_path in paths.items()}
+            if not approaches:
                 self._label.visible = False
                 return float("inf")
-            if len(found) > 1 and np.linalg.norm(found[""].point - ways[""][-1]) < self._radius:
-                del found[""]  # the true path still approaches the target
-            kind, approach = next(iter(found.items()))
+            if len(approaches) > 1 and np.linalg.norm(approaches[""].point - paths[""][-1]) < self._radius:
+                del approaches[""]  # the true path still approaches the target
+            kind, approach = next(iter(approaches.items()))
             self._line("miss", np.stack([approach.point, self.target]), TARGET, 0.012)
             self._label.text, self._label.visible = f"{100.0 * approach.distance:.1f} cm{kind}", True
         return approach.distance
 
     def fan(self, paths: np.ndarray | None, costs: np.ndarray | None = None) -> None:
         """Draw candidates' paths (N, T, 3) [m], coloured by the rank of their costs (N,), if these are finite."""
-        place = f"{self._name}/path/fan"
-        if paths is None or costs is None or not (sound := np.isfinite(costs)).any():
-            self._server.scene.remove_by_name(place)
+        node = f"{self._name}/path/fan"
+        if paths is None or costs is None or not (is_finite := np.isfinite(costs)).any():
+            self._server.scene.remove_by_name(node)
             return
-        paths, costs = paths[sound], costs[sound]
+        paths, costs = paths[is_finite], costs[is_finite]
         rank = np.argsort(np.argsort(costs)) / max(1, len(costs) - 1)
         colours = (255.0 * colormaps[FAN](CHEAP + (DEAR - CHEAP) * rank)[:, :3]).astype(np.uint8)
         segments = np.stack([paths[:, :-1], paths[:, 1:]], axis=2).reshape(-1, 2, 3)
-        repeated = np.broadcast_to(colours[:, None, None], (len(paths), paths.shape[1] - 1, 2, 3)).reshape(-1, 2, 3)
-        self._server.scene.add_line_segments(place, segments.astype(np.float32), repeated, thickness=0.006)
+        segment_colours = np.broadcast_to(colours[:, None, None], (len(paths), paths.shape[1] - 1, 2, 3)).reshape(
+            -1, 2, 3
+        )
+        self._server.scene.add_line_segments(node, segments.astype(np.float32), segment_colours, thickness=0.006)
 
     def position(self, state: np.ndarray) -> np.ndarray:
         """Return positions (*, 3) [m] of the traced link in states (*, L, 13)."""
@@ -118,8 +122,8 @@ class Lane:
             return
         segments = np.stack([points, np.roll(points, -1, axis=0)], axis=1)[: max(1, len(points) - 1)].astype(np.float32)
         if line is None:
-            place = f"{self._name}/path/{name}"
-            self._lines[name] = self._server.scene.add_line_segments(place, segments, colour, thickness=thickness)
+            node = f"{self._name}/path/{name}"
+            self._lines[name] = self._server.scene.add_line_segments(node, segments, colour, thickness=thickness)
         else:  # updating a line takes a fraction of the time of adding one
             line.points, line.visible = segments, True
 
@@ -151,22 +155,22 @@ class Stage:
 
     def frame(self, points: np.ndarray) -> None:
         """Set the points (P, 3) [m] that cameras must see, and the camera of newly opened pages and of a reset view."""
-        self._seen = around(points)
+        self._visible_points = around(points)
         camera = self.camera("side", 1.6)
-        first = self._server.initial_camera
-        first.fov, first.position, first.look_at = FIELD_OF_VIEW, camera.place, self.middle(camera)
+        initial = self._server.initial_camera
+        initial.fov, initial.position, initial.look_at = FIELD_OF_VIEW, camera.position, self.middle(camera)
 
     def camera(self, view: View, aspect: float) -> PictureCamera:
         """Return the camera that sees all points set by `frame`. aspect: width over height of its picture."""
-        return PictureCamera.of(self._seen, 1.0 / aspect, view, float(np.tan(0.5 * FIELD_OF_VIEW)) * aspect)
+        return PictureCamera.of(self._visible_points, 1.0 / aspect, view, float(np.tan(0.5 * FIELD_OF_VIEW)) * aspect)
 
     def middle(self, camera: PictureCamera) -> np.ndarray:
         """Return the point (3,) [m] that a camera orbits: on its axis, at the mean depth of the points of `frame`."""
-        depth = float(camera.depth(self._seen).mean())
-        return np.asarray(camera.place + depth * camera.axes[2])
+        depth = float(camera.depth(self._visible_points).mean())
+        return np.asarray(camera.position + depth * camera.axes[2])
 
 
-def whole(recording: Recording) -> np.ndarray:
+def points_in_view(recording: Recording) -> np.ndarray:
     """Return the points (P, 3) [m] of a recording that a camera must see.
 
     They are the links of the first state, the path of the ball up to its target, and the target.
@@ -207,14 +211,14 @@ def _pitch(server: viser.ViserServer) -> None:
             font_screen_scale=0.7,
         )
     ahead, width, height = GOAL
-    for name, size, place in (
+    for name, size, position in (
         ("left", (0.08, 0.08, height), (ahead, 0.5 * width, 0.5 * height)),
         ("right", (0.08, 0.08, height), (ahead, -0.5 * width, 0.5 * height)),
         ("bar", (0.08, width + 0.08, 0.08), (ahead, 0.0, height)),
     ):
-        server.scene.add_box(f"/goal/{name}", POSTS, size, position=place)
+        server.scene.add_box(f"/goal/{name}", POSTS, size, position=position)
     across = np.linspace(-0.5, 0.5, 13) * width
-    down = [(ahead + 0.8 * share, height * (1.0 - share)) for share in np.linspace(0.0, 1.0, 9)]
+    slope = [(ahead + 0.8 * share, height * (1.0 - share)) for share in np.linspace(0.0, 1.0, 9)]
     net = [((ahead, y, height), (ahead + 0.8, y, 0.0)) for y in across]
-    net += [((x, across[0], z), (x, across[-1], z)) for x, z in down]
+    net += [((x, across[0], z), (x, across[-1], z)) for x, z in slope]
     server.scene.add_line_segments("/goal/net", np.array(net, np.float32), LINES, thickness=0.01)

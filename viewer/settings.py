@@ -1,4 +1,4 @@
-"""Settings that a task offers on its page, and those that its users choose."""
+"""Settings of a kick on the page of a task: those that its users choose, and what they can choose from."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Box = tuple[tuple[float, ...], tuple[float, ...]]
 """Lowest and highest corner of a box [m] or [m/s]."""
 
 
-class Wishes(NamedTuple):
+class Settings(NamedTuple):
     """Settings of the next kick, as chosen on the page.
 
     target: (3,) [m]. spot: (2,), offset of the ball from its usual position [m]. roll: (2,), its rolling velocity
