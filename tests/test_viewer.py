@@ -145,7 +145,7 @@ def test_prediction_is_aligned_with_the_truth(recording: Recording) -> None:
         np.testing.assert_allclose(expected[:, 0], recording.states[row, :, 0])
 
 
-def test_page_follows_and_plays(page: LivePage, recording: Recording, capsys: pytest.CaptureFixture) -> None:
+def test_page_follows_and_plays(page: LivePage, recording: Recording, capsys: pytest.CaptureFixture[str]) -> None:
     page.begin(recording.scene, recording.target)
     began = time.monotonic()
     for row, state in enumerate(recording.states):

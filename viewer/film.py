@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from larp_model.errors import InputError
 from larp_model.files import write_whole
+from larp_model.scene import Link, Scene
 from larp_model.state import ORIENTATION, POSITION
 from viewer.camera import PictureCamera, around
 from viewer.recording import Approach, Recording, nearest_approach
@@ -84,16 +85,16 @@ def frames(recording: Recording, size: tuple[int, int] = (1280, 720), rate: floa
     camera = PictureCamera.of(_points_in_view(recording, approach), size[1] / size[0])
     across = size[1] / size[0]
     figure = Figure((size[0] / DOTS, size[1] / DOTS), DOTS, facecolor=SKY)
-    canvas = FigureCanvasAgg(figure)
+    canvas: Any = FigureCanvasAgg(figure)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(-1.0, 1.0), ylim=(-across, across))
     axes.set_axis_off()
-    _ground(axes, camera)
+    _draw_ground(axes, camera)
     canvas.draw()
     ground = canvas.copy_from_bbox(figure.bbox)
     _clear(axes)
     for time in _times(recording, approach, rate):
         canvas.restore_region(ground)
-        _scene(axes, camera, recording, approach, time)
+        _draw_scene(axes, camera, recording, approach, time)
         axes.draw(canvas.get_renderer())
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
         _clear(axes)
@@ -120,7 +121,7 @@ def _points_in_view(recording: Recording, approach: Approach) -> np.ndarray:
     return around(links, ball_path, np.asarray(recording.target, float))
 
 
-def _ground(axes: Axes, camera: PictureCamera) -> None:
+def _draw_ground(axes: Axes, camera: PictureCamera) -> None:
     """Draw the ground, a metre grid that fades with distance; it never moves and is drawn only once."""
     horizon = float(camera(camera.position + 1e4 * (camera.axes[2] * (1.0, 1.0, 0.0)))[1])
     axes.axhspan(-1.0, horizon, color=GROUND, zorder=0)
@@ -138,79 +139,105 @@ def _ground(axes: Axes, camera: PictureCamera) -> None:
                 axes.add_collection(LineCollection(list(segments), colors=colours, lw=0.8, zorder=0.1))
 
 
-def _scene(axes: Axes, camera: PictureCamera, recording: Recording, approach: Approach, time: float) -> None:
+def _draw_scene(axes: Axes, camera: PictureCamera, recording: Recording, approach: Approach, time: float) -> None:
     """Draw everything that changes between frames, at a time [s] of the recording."""
-    dt, target = recording.scene.dt, np.asarray(recording.target, float)
-    row = min(int(time / dt), len(recording.states) - 1)
-    state, traced = recording.states[row], recording.traced % len(recording.scene.links)
-    shadows, links = [], []
-    for index, link in enumerate(recording.scene.links):
-        rotation = Rotation.from_quat(state[index, ORIENTATION], scalar_first=True)
-        half_axis = 0.5 * link.length * rotation.apply(link.axis)
-        ends = state[index, POSITION] + np.stack([half_axis, -half_axis])
-        shadows.append(_shadow(camera, ends, link.radius))
-        if index == traced:
-            continue
-        shift = np.array([0.0, 0.0, 0.3]) - 0.15 * camera.axes[0]  # towards the light
-        colour = link_colour(link)
-        lit = _hull(camera, ends + link.radius * shift, 0.55 * link.radius)
-        links.append((float(camera.depth(ends).mean()), (_hull(camera, ends, link.radius), colour, lit)))
-    axes.add_collection(PolyCollection(shadows, facecolors=SHADOW, edgecolors="none", zorder=0.2))
+    target, ball = np.asarray(recording.target, float), recording.traced % len(recording.scene.links)
+    row = min(int(time / recording.scene.dt), len(recording.states) - 1)
+    state = recording.states[row]
+    _draw_shadows(axes, camera, recording.scene, state)
     goal, size = camera.sphere(target, recording.radius)
-    _disc(axes, goal, size, fc=_rgb(TARGET), alpha=0.35, ec=_rgb(TARGET), lw=1.5, zorder=1)
+    _draw_disc(axes, goal, size, fc=_rgb(TARGET), alpha=0.35, ec=_rgb(TARGET), lw=1.5, zorder=1)
+    _draw_paths(axes, camera, recording, row)
+    _draw_links(axes, camera, recording.scene, state, ball)
+    _draw_ball(axes, camera, state[ball], recording.radius)
+    predicted = recording.predicted_at(row)
+    if predicted is not None:
+        middle, size = camera.sphere(predicted[ball, POSITION], recording.radius)
+        _draw_disc(axes, middle, size, fill=False, ec=_rgb(PREDICTION), lw=1.6, ls=(0, (4, 3)), zorder=3.9)
+    if row > approach.row:
+        _draw_miss(axes, camera, approach, target)
+    slow = time < approach.row * recording.scene.dt + SLOW_AFTER
+    _draw_captions(axes, recording.title or "Kick", f"{time:.2f} s" + (f", at {SLOW:g} of its speed" if slow else ""))
+
+
+def _capsule_ends(link: Link, state: np.ndarray) -> np.ndarray:
+    """Return the ends (2, 3) [m] of a link's axis in its state (13,)."""
+    half_axis = 0.5 * link.length * Rotation.from_quat(state[ORIENTATION], scalar_first=True).apply(link.axis)
+    return np.asarray(state[POSITION] + np.stack([half_axis, -half_axis]))
+
+
+def _draw_shadows(axes: Axes, camera: PictureCamera, scene: Scene, state: np.ndarray) -> None:
+    """Draw the shadows that all links cast on the ground in a state (L, 13)."""
+    outlines = [
+        _shadow(camera, _capsule_ends(link, row), link.radius) for link, row in zip(scene.links, state, strict=True)
+    ]
+    axes.add_collection(PolyCollection(outlines, facecolors=SHADOW, edgecolors="none", zorder=0.2))
+
+
+def _draw_paths(axes: Axes, camera: PictureCamera, recording: Recording, row: int) -> None:
+    """Draw the path of the ball up to a row of the recording, and all of its predicted path."""
     paths: list[tuple[np.ndarray, Colour, Any, float]] = [(recording.path[: row + 1], GROUND_TRUTH, "-", 2.5)]
     if recording.predicted_path is not None:
         paths.append((recording.predicted_path, PREDICTION, (0, (4, 3)), 1.6))
     for path, colour, style, width in paths:
         visible = path[camera.depth(path) > NEAR]
         axes.plot(*camera(visible).T, color=_rgb(colour), ls=style, lw=width, zorder=2, solid_capstyle="round")
-    # The ball is drawn in order of depth: behind links that are nearer to the camera.
-    ball_depth = camera.depth(state[traced, POSITION])
-    order = sorted(links, key=lambda entry: -entry[0])
-    for layer, (depth, (outline, colour, lit)) in enumerate(order):
-        order_z = 3.0 + 0.01 * layer + (1.0 if depth < ball_depth else 0.0)
-        polygons = PolyCollection([outline], facecolors=[_rgb(colour)], edgecolors="white", lw=0.8, zorder=order_z)
+
+
+def _draw_links(axes: Axes, camera: PictureCamera, scene: Scene, state: np.ndarray, ball: int) -> None:
+    """Draw all links but the ball in a state (L, 13), far ones first, each with a lighter area towards the light.
+
+    Links that are nearer to the camera than the ball are drawn over it.
+    """
+    towards_light = np.array([0.0, 0.0, 0.3]) - 0.15 * camera.axes[0]
+    capsules = []
+    for index, link in enumerate(scene.links):
+        if index != ball:
+            ends = _capsule_ends(link, state[index])
+            lit = _hull(camera, ends + link.radius * towards_light, 0.55 * link.radius)
+            outline, colour = _hull(camera, ends, link.radius), _rgb(link_colour(link))
+            capsules.append((float(camera.depth(ends).mean()), outline, colour, lit))
+    ball_depth = camera.depth(state[ball, POSITION])
+    capsules.sort(key=lambda capsule: -capsule[0])
+    for layer, (depth, outline, colour, lit) in enumerate(capsules):
+        zorder = 3.0 + 0.01 * layer + (1.0 if depth < ball_depth else 0.0)
+        polygons = PolyCollection([outline], facecolors=[colour], edgecolors="white", lw=0.8, zorder=zorder)
         axes.add_collection(polygons)
-        shine = tuple(1.0 - 0.78 * (1.0 - part) for part in _rgb(colour))
-        axes.add_collection(PolyCollection([lit], facecolors=[shine], edgecolors="none", zorder=order_z))
-    _ball(axes, camera, state[traced], recording.radius)
-    predicted = recording.predicted_at(row)
-    if predicted is not None:
-        middle, size = camera.sphere(predicted[traced, POSITION], recording.radius)
-        _disc(axes, middle, size, fill=False, ec=_rgb(PREDICTION), lw=1.6, ls=(0, (4, 3)), zorder=3.9)
-    is_past = row > approach.row
-    if is_past:
-        ends = camera(np.stack([approach.point, target]))
-        axes.plot(*ends.T, color=INK, lw=1.5, zorder=5)
-        text = f"{100.0 * approach.distance:.1f} cm from the target"
-        axes.annotate(
-            text,
-            (float(goal[0]), float(goal[1])),
-            (0.0, 26.0),
-            textcoords="offset points",
-            ha="center",
-            fontsize=13,
-            color=INK,
-            zorder=6,
-        )
-    slow = time < approach.row * dt + SLOW_AFTER
-    pace = f"{time:.2f} s" + (f", at {SLOW:g} of its speed" if slow else "")
-    axes.text(0.025, 0.95, recording.title or "Kick", transform=axes.transAxes, fontsize=17, weight="bold", va="top")
-    axes.text(0.025, 0.885, pace, transform=axes.transAxes, fontsize=12, color=QUIET, va="top")
-    for line, (what, colour) in enumerate(
-        (("truth (MuJoCo)", GROUND_TRUTH), ("prediction", PREDICTION), ("target", TARGET))
-    ):
-        axes.text(
-            0.975, 0.95 - 0.045 * line, what, transform=axes.transAxes, fontsize=12, ha="right", va="top",
-            color=_rgb(colour),
-        )  # fmt: skip
+        shine = tuple(1.0 - 0.78 * (1.0 - part) for part in colour)
+        axes.add_collection(PolyCollection([lit], facecolors=[shine], edgecolors="none", zorder=zorder))
 
 
-def _ball(axes: Axes, camera: PictureCamera, state: np.ndarray, radius: float) -> None:
+def _draw_miss(axes: Axes, camera: PictureCamera, approach: Approach, target: np.ndarray) -> None:
+    """Draw the distance between the target (3,) [m] and the closest point of the ball's path, and write it above."""
+    ends = camera(np.stack([approach.point, target]))
+    axes.plot(*ends.T, color=INK, lw=1.5, zorder=5)
+    axes.annotate(
+        f"{100.0 * approach.distance:.1f} cm from the target",
+        (float(ends[1, 0]), float(ends[1, 1])),
+        (0.0, 26.0),
+        textcoords="offset points",
+        ha="center",
+        fontsize=13,
+        color=INK,
+        zorder=6,
+    )
+
+
+def _draw_captions(axes: Axes, title: str, clock: str) -> None:
+    """Write the title and the time in one corner, and the meaning of the colours in another."""
+    style: dict[str, Any] = {"transform": axes.transAxes, "va": "top"}
+    axes.text(0.025, 0.95, title, fontsize=17, weight="bold", **style)
+    axes.text(0.025, 0.885, clock, fontsize=12, color=QUIET, **style)
+    legend = (("truth (MuJoCo)", GROUND_TRUTH), ("prediction", PREDICTION), ("target", TARGET))
+    for line, (label, colour) in enumerate(legend):
+        axes.text(0.975, 0.95 - 0.045 * line, label, fontsize=12, ha="right", color=_rgb(colour), **style)
+
+
+def _draw_ball(axes: Axes, camera: PictureCamera, state: np.ndarray, radius: float) -> None:
     """Draw the ball as a white disc with those of its dark patches that face the camera."""
     centre = state[POSITION]
     middle, size = camera.sphere(centre, radius)
-    _disc(axes, middle, size, fc=_rgb(BALL_PATCHES[0]), ec=INK, lw=1.2, zorder=3.8)
+    _draw_disc(axes, middle, size, fc=_rgb(BALL_PATCHES[0]), ec=INK, lw=1.2, zorder=3.8)
     vertices, faces = football_meshes(radius, subdivisions=1)[1]
     rotated = Rotation.from_quat(state[ORIENTATION], scalar_first=True).apply(vertices)
     towards = camera.position - centre
@@ -234,10 +261,11 @@ def _shadow(camera: PictureCamera, ends: np.ndarray, radius: float) -> np.ndarra
 
 
 def _wrapped(points: np.ndarray) -> np.ndarray:
-    return points[ConvexHull(points).vertices]
+    outline: np.ndarray = points[ConvexHull(points).vertices]
+    return outline
 
 
-def _disc(axes: Axes, middle: np.ndarray, size: float, **style: Any) -> None:
+def _draw_disc(axes: Axes, middle: np.ndarray, size: float, **style: Any) -> None:
     axes.add_patch(Circle((float(middle[0]), float(middle[1])), size, **style))
 
 

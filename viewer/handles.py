@@ -103,7 +103,8 @@ class Handles:
     @property
     def ball_position(self) -> np.ndarray:
         """Return the initial position (3,) [m] of the ball as it is set by its handle."""
-        return self._ball + np.array((*self.spot, 0.0))
+        position: np.ndarray = self._ball + np.array((*self.spot, 0.0))
+        return position
 
     def aim(self, target: Sequence[float] | np.ndarray) -> None:
         """Move the target to (3,) [m], clipped to the box that is offered, as if it had been dragged."""

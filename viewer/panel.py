@@ -84,7 +84,7 @@ class Panel:
         """Add a button that requests an action by name."""
 
         @self._gui.add_button(label).on_click
-        async def _(event: viser.GuiEvent) -> None:
+        async def _(event: viser.GuiEvent[Any]) -> None:
             self._on_request(name, event.client)
 
     def _add_buttons(self, label: str, names: Mapping[str, str]) -> None:
@@ -92,7 +92,7 @@ class Panel:
         group = self._gui.add_button_group(label, tuple(names))
 
         @group.on_click
-        async def _(event: viser.GuiEvent) -> None:
+        async def _(event: viser.GuiEvent[Any]) -> None:
             self._on_request(names[option(group.value, tuple(names))], event.client)
 
     def _add_shortcut(self, label: str, name: str, key: str) -> None:
@@ -102,12 +102,12 @@ class Panel:
         async def _(event: viser.CommandEvent) -> None:
             self._on_request(name, event.client)
 
-    def _add_setting(self, name: str, handle: Any) -> None:
+    def _add_setting(self, name: str, handle: viser.GuiInputHandle[Any]) -> None:
         """Register a control by name; whenever it changes, `on_change` is called."""
         self._controls[name] = handle
 
         @handle.on_update
-        async def _(event: viser.GuiEvent) -> None:
+        async def _(event: viser.GuiEvent[Any]) -> None:
             self._on_change()
 
     def _add_settings(self, offer: Offer) -> None:
@@ -140,7 +140,7 @@ class Panel:
             self._terms[name] = handle
 
             @handle.on_update
-            async def _(event: viser.GuiEvent) -> None:
+            async def _(event: viser.GuiEvent[Any]) -> None:
                 self._on_change()
 
         self._add_button("As they were", "weights")
@@ -162,7 +162,7 @@ class Panel:
             for handle in self._ghosts.values():
 
                 @handle.on_update
-                async def _(event: viser.GuiEvent) -> None:
+                async def _(event: viser.GuiEvent[Any]) -> None:
                     self._on_request("look", event.client)
 
             if self._offer:

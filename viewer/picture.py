@@ -42,7 +42,7 @@ def kick_picture(recording: Recording, costs: Mapping[str, Sequence[float]] | No
         if not np.isnan(values := _positive(raw_values)).all()
     }
     figure = Figure((WIDTH, HEIGHT), DOTS, facecolor="white")
-    canvas = FigureCanvasAgg(figure)
+    canvas: Any = FigureCanvasAgg(figure)
     miss = nearest_approach(recording.path, recording.target).distance
     facts = {"nearest to the target": f"{100.0 * miss:.1f} cm", **recording.summary}
     figure.text(0.02, 0.955, recording.title or "Kick", fontsize=20, fontweight="bold")
@@ -132,7 +132,8 @@ def _capsule(scene: Scene, state: np.ndarray, row: int, points: int = 24) -> np.
     turn = np.arctan2(along[1], along[0]) + np.linspace(-0.5 * np.pi, 0.5 * np.pi, points)
     cap = link.radius * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     reach = 0.5 * link.length * along
-    return state[row, POSITION][[0, 2]] + np.concatenate([reach + cap, -reach - cap])
+    contour: np.ndarray = state[row, POSITION][[0, 2]] + np.concatenate([reach + cap, -reach - cap])
+    return contour
 
 
 def _paths(above: Axes, beside: Axes, recording: Recording) -> None:
@@ -147,7 +148,8 @@ def _paths(above: Axes, beside: Axes, recording: Recording) -> None:
     rotation = np.array([[direction[0], direction[1], 0.0], [-direction[1], direction[0], 0.0], [0.0, 0.0, 1.0]])
 
     def view(points: np.ndarray) -> np.ndarray:
-        return (points - [start[0], start[1], 0.0]) @ rotation.T
+        turned: np.ndarray = (points - [start[0], start[1], 0.0]) @ rotation.T
+        return turned
 
     approach = nearest_approach(recording.path, target)
     path, nearest, goal = view(recording.path), view(approach.point), view(target)
