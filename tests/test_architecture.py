@@ -77,6 +77,8 @@ ORDER = [
     "viewer.scene_view",
     "viewer.stage",
     "viewer.panel",
+    "viewer.live_data",
+    "viewer.clients",
     "viewer.handles",
     "viewer.app",
     "viewer.replay",

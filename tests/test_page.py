@@ -90,10 +90,10 @@ def browser() -> Iterator[Browser]:
 
 def opened(browser: Browser, served: Served, size: tuple[int, int] = SMALL) -> Page:
     seen = browser.new_page(viewport={"width": size[0], "height": size[1]})
-    before = len(served.page._views)
+    before = len(served.page._clients.views)
     seen.goto(served.page.address)
     seen.get_by_text("LARP-MPC").first.wait_for()
-    until(lambda: len(served.page._views) > before)
+    until(lambda: len(served.page._clients.views) > before)
     return seen
 
 
@@ -140,7 +140,7 @@ def pixels(seen: Page, path: Path) -> np.ndarray:
 
 def placed(seen: Page, served: Served, point: np.ndarray) -> tuple[float, float]:
     """Where a point (3,) [m] is on the page, in pixels."""
-    stage, (view, aspect) = served.page._stage, [*served.page._views.values()][-1]
+    stage, (view, aspect) = served.page._stage, [*served.page._clients.views.values()][-1]
     assert stage is not None
     camera = stage.camera(next(each for each in VIEWS if each == view), aspect)
     box = seen.locator("canvas").first.bounding_box()
@@ -375,7 +375,7 @@ def unfolded(seen: Page, label: str) -> Locator:
 @pytest.mark.parametrize("view", [*VIEWS, "follow"])
 def test_each_client_looks_from_where_it_likes(view: str, played: Page, served: Served) -> None:
     unfolded(played, view).click()
-    until(lambda: [each for each, _ in served.page._views.values()] == [view])
+    until(lambda: [each for each, _ in served.page._clients.views.values()] == [view])
     ((_, client),) = served.page._server.get_clients().items()
     stage = served.page._stage
     assert stage is not None
@@ -426,4 +426,4 @@ def test_reloads_do_not_hold_up_who_plans(played: Page, served: Served) -> None:
         again(seen)
     until(lambda: served.live.run is not before)
     assert served.live.run is not None and served.live.run.truth_error_m < np.inf
-    until(lambda: len(served.page._views) == 1)
+    until(lambda: len(served.page._clients.views) == 1)

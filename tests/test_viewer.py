@@ -19,9 +19,9 @@ from larp_model.bodies import human_and_ball
 from larp_model.errors import InputError
 from larp_model.state import ORIENTATION, POSITION, VELOCITY
 from viewer import LivePage, Recording, check_film, kick_picture, nearest_approach, write_film, write_html
-from viewer.app import LiveData, StateUpdate
 from viewer.camera import PictureCamera
 from viewer.film import frames
+from viewer.live_data import LiveData, StateUpdate
 from viewer.panel import Panel
 from viewer.scene_view import Mesh, SceneView, football_meshes, unit_meshes
 
@@ -279,6 +279,6 @@ def test_a_file_is_not_handed_to_a_client_that_has_left(page: LivePage, recordin
     gone = Mock(client_id=7)
     page.finish(recording)
     page.files = lambda kind, recording: ("kick.html", b"<!doctype html>")
-    page._download(gone, "html")
-    assert page._download_lock.acquire(timeout=30.0), "the next file may be made"
+    page._clients.download(gone, "html", page.recording, page.files)
+    assert page._clients._download_lock.acquire(timeout=30.0), "the next file may be made"
     gone.send_file_download.assert_not_called()

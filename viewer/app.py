@@ -10,12 +10,10 @@ from __future__ import annotations
 import queue
 import threading
 import time as clock
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import viser
@@ -23,9 +21,10 @@ import viser
 from larp_model.errors import InputError
 from larp_model.scene import Scene
 from larp_model.state import POSITION
-from viewer.camera import VIEWS, View
-from viewer.checked import within
+from viewer.camera import View
+from viewer.clients import Clients, Files
 from viewer.handles import Handles
+from viewer.live_data import LiveData, StateUpdate
 from viewer.panel import Panel
 from viewer.recording import Recording, mask_unpredicted, nearest_approach
 from viewer.server import address_of, close_server, open_server
@@ -33,51 +32,14 @@ from viewer.settings import Offer, Push, Settings
 from viewer.stage import LEGEND, Stage, points_in_view
 
 FRAME = 1.0 / 25.0  # s
-# Frames by which drawing may be behind the execution, whose states arrive in bursts.
-LAG = 5
 # Clients that are served at the full frame rate; with more it drops, for each of them costs the planner some time.
 FULL_RATE_CLIENTS = 5
-FOLLOWED = (-2.2, -3.2, 1.4)  # m, from the ball to a camera that follows it
 
 Mode = Literal["waiting", "planned", "running", "replay"]
 
 
 class PageClosedError(Exception):
     """Error raised by calls that wait for the page once it is closed."""
-
-
-class StateUpdate(NamedTuple):
-    """State (L, 13) of the ground truth at a time [s], the new prediction from there, and the reference's state."""
-
-    state: np.ndarray
-    time: float
-    predicted: np.ndarray | None
-    reference: np.ndarray | None
-
-
-@dataclass
-class LiveData:
-    """Data of a kick that is planned or running; a plan, fan or reference that is None is not drawn."""
-
-    state: np.ndarray
-    time: float
-    path: list[np.ndarray] = field(default_factory=list)  # states (L, 13) so far
-    plan: np.ndarray | None = None
-    plan_time: float = 0.0
-    fan: tuple[np.ndarray, np.ndarray] | None = None
-    reference: np.ndarray | None = None
-    state_is_new: bool = True  # the state is not drawn yet
-    plan_is_new: bool = True  # the plan and its fan are not drawn yet
-    updates: deque[StateUpdate] = field(default_factory=deque)
-
-    def advance(self) -> None:
-        """Take the next update, or skip some if many wait: they arrive in bursts, between plans."""
-        for _ in range(-(-len(self.updates) // LAG)):
-            update = self.updates.popleft()
-            if update.predicted is not None:
-                self.plan, self.plan_time, self.plan_is_new = mask_unpredicted(update.predicted), update.time, True
-            self.path.append(update.state)
-            self.state, self.time, self.reference, self.state_is_new = update.state, update.time, update.reference, True
 
 
 class LivePage:
@@ -114,12 +76,11 @@ class LivePage:
         self._beside: Recording | None = None
         self._drawn_frame: tuple[int, frozenset[str]] | None = None  # row of the recording that is drawn, and ghosts
         self._single_steps = 0  # single steps still to take while paused
-        self._views: dict[int, tuple[str, float]] = {}  # by client: its view, and the aspect this was for
-        self._download_lock = threading.Lock()
-        self.files: Callable[[str, Recording], tuple[str, bytes]] | None = None
+        self._clients = Clients(self._server, self._camera)
+        self.files: Files | None = None
         self._panel = Panel(self._server.gui, self._handle_request, self._change, offer)
-        self._server.on_client_connect(self._connect)
-        self._server.on_client_disconnect(self._disconnect)
+        self._server.on_client_connect(self._clients.connect)
+        self._server.on_client_disconnect(self._clients.disconnect)
         self._thread = threading.Thread(target=self._draw, daemon=True)
         self._thread.start()
 
@@ -151,9 +112,9 @@ class LivePage:
                 if self._live:
                     self._live.state_is_new = self._live.plan_is_new = True
         elif request_name.startswith("view ") and client is not None:
-            self._set_view(client, request_name.removeprefix("view "))
+            self._clients.set_view(client, request_name.removeprefix("view "))
         elif request_name.startswith("download ") and client is not None:
-            self._download(client, request_name.removeprefix("download "))
+            self._clients.download(client, request_name.removeprefix("download "), self._recording, self.files)
         else:
             self._requests.put(request_name)
         self._wake.set()
@@ -379,7 +340,7 @@ class LivePage:
     def _draw(self) -> None:
         last = due = clock.monotonic()
         while not self._closed.wait(max(0.0, due - clock.monotonic())):
-            pace = FRAME * max(1.0, len(self._views) / FULL_RATE_CLIENTS)
+            pace = FRAME * max(1.0, len(self._clients.views) / FULL_RATE_CLIENTS)
             if self._mode == "running":
                 self._idle.wait(pace)  # otherwise it would take one of few cores from the planner
             now = clock.monotonic()
@@ -390,6 +351,14 @@ class LivePage:
                 elif self._stage is not None and self._live is not None:
                     self._draw_live(self._stage, self._live)
             last = now
+
+    def _camera(self, view: View, aspect: float) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return position (3,) and point looked at (3,) [m] of a view; None before `begin`."""
+        with self._lock:
+            if self._stage is None:
+                return None
+            camera = self._stage.camera(view, aspect)
+            return camera.position, self._stage.middle(camera)
 
     def _draw_recording(self, recording: Recording, elapsed: float) -> None:
         stage = self._stage
@@ -407,7 +376,7 @@ class LivePage:
                     prediction=replayed.predicted_at(lane_row),
                     reference=replayed.reference_at(lane_row),
                 )
-        self._follow(stage.lane.position(recording.states[min(row, len(recording.states) - 1)]))
+        self._clients.follow(stage.lane.position(recording.states[min(row, len(recording.states) - 1)]))
         self._drawn_frame = row, ghosts
         self._frames += 1
 
@@ -433,63 +402,8 @@ class LivePage:
                 lane.fan(*(live.fan or (None, None)) if "fan" in lane.visible_ghosts else (None, None))
             if self._mode == "running" or self.offer is None:
                 self._panel.write(f"**Kicking**, {live.time:.2f} s: {100.0 * miss:.1f} cm from the target\n\n{LEGEND}")
-            self._follow(lane.position(live.state))
+            self._clients.follow(lane.position(live.state))
         live.state_is_new = live.plan_is_new = False
-
-    # Cameras and files, each client's own.
-
-    def _connect(self, client: viser.ClientHandle) -> None:
-        self._set_view(client, "side")
-
-        # The panel and the size of the window change the aspect of the picture.
-        @client.camera.on_update
-        async def _(camera: viser.CameraHandle) -> None:
-            view, aspect = self._views.get(client.client_id, ("", 1.0))
-            if view and abs(aspect_of(camera) / aspect - 1.0) > 0.02:
-                self._set_view(client, view)
-
-    def _disconnect(self, client: viser.ClientHandle) -> None:
-        self._views.pop(client.client_id, None)
-
-    def _set_view(self, client: viser.ClientHandle, view: str) -> None:
-        aspect = aspect_of(client.camera)
-        self._views[client.client_id] = view, aspect
-        picture_view: View | None = next((name for name in VIEWS if name == view), None)
-        with self._lock:
-            if self._stage is None or picture_view is None:
-                return
-            camera, stage = self._stage.camera(picture_view, aspect), self._stage
-        with client.atomic():
-            client.camera.position, client.camera.look_at = camera.position, stage.middle(camera)
-
-    def _follow(self, ball: np.ndarray) -> None:
-        for number, client in self._server.get_clients().items():
-            if self._views.get(number, ("",))[0] == "follow":
-                with client.atomic(), suppress(ValueError):  # of a client whose camera is invalid
-                    client.camera.position, client.camera.look_at = ball + FOLLOWED, ball
-
-    def _download(self, client: viser.ClientHandle, kind: str) -> None:
-        """Make a file of the recording that is replayed, in a thread of its own, and send it to one client."""
-        recording, files = self._recording, self.files
-        if recording is None or files is None or not self._download_lock.acquire(blocking=False):
-            reason = "Kick first." if recording is None else "Another file is being made."
-            client.add_notification("Not now", reason, auto_close_seconds=4.0)
-            return
-
-        def make() -> None:
-            try:
-                name, content = files(kind, recording)
-                if client.client_id in self._server.get_clients():  # it may have left meanwhile
-                    client.send_file_download(name, content, save_immediately=True)
-            finally:
-                self._download_lock.release()
-
-        threading.Thread(target=make, daemon=True).start()
-
-
-def aspect_of(camera: viser.CameraHandle) -> float:
-    """Return width over height of a client's picture, clipped to a sensible range."""
-    return within(camera.aspect, 0.2, 5.0)
 
 
 def summary_text(recording: Recording) -> str:

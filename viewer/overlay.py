@@ -62,9 +62,9 @@ class Overlay:
     def at(self, row: int) -> np.ndarray:
         """Return keypoints and their points on the human (K, 2, 3) [m], of the frame nearest to a row of the states."""
         frame = min(round(row * self.scene.dt * self.rate), len(self.keypoints) - 1)
-        pairs = np.stack([self.keypoints[frame], self.body_points[frame]], axis=1).astype(np.float32)
+        pairs = np.stack([self.keypoints[frame], self.body_points[frame]], axis=1)
         existing: np.ndarray = pairs[np.isfinite(pairs).all(axis=(1, 2))]
-        return existing
+        return existing.astype(np.float32)
 
 
 def overlay_page(overlay: Overlay) -> str:
