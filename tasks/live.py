@@ -198,47 +198,25 @@ class Live:
         settings = self.page.settings
         if (task := self._prepare(settings)) is None:
             return
-        world, due_time = PushableWorld(task.scene, task.substeps), time.monotonic()
-        planners, records = self.planners(settings), list[PlanRecord]()
-        goals = [settings.target]
+        world, records = PushableWorld(task.scene, task.substeps), list[PlanRecord]()
+        targets = [settings.target]
 
         def window(step: int) -> Window:
-            goals.append(self.page.settings.target)
+            targets.append(self.page.settings.target)
             return self._window(task)(step)
-
-        def observe(execution: Execution) -> None:
-            nonlocal due_time
-            step = len(execution.states) - 1
-            last = plans_of(execution)[-1]
-            predicted = last.info.states if last.step == step - 1 else None
-            reference = task.reference.states
-            self.page.update(
-                execution.states[-1], predicted, step * task.scene.dt, reference[min(step, len(reference) - 1)]
-            )
-            if predicted is not None:
-                records.append(last)
-                self._show_figures(records, settings, task.scene.dt)
-            due_time = due(due_time, task.scene.dt / self.page.speed)
-            self.page.hold(due_time)
-            while (request := self.page.next_request()) is not None:
-                if request.startswith("push "):
-                    body = task.scene.bodies[-1 if request.endswith("ball") else 0].name
-                    world.pushes.append(self.page.push(body))
-                elif request in ("reset", "kick"):
-                    raise InterruptedKickError(request)
 
         try:
             execution = self.session(settings).execute(
-                planners,
+                self.planners(settings),
                 settings.target,
                 self.seed,
                 initial_state(task, settings),
-                observe=observe,
+                observe=self._observer(task, settings, world, records),
                 world=world,
                 window=window,
             )
             labels = {name: getattr(settings, name) for name in ("preset", "dynamics", "weights")}
-            self.run = Run.of(task, execution, task.check(goals[-1]), **labels, seed=self.seed)
+            self.run = Run.of(task, execution, task.check(targets[-1]), **labels, seed=self.seed)
             self.recording = self.run.recording
         except InterruptedKickError as interruption:
             if str(interruption) == "kick":
@@ -254,6 +232,39 @@ class Live:
         self.page.finish(self.recording)
         if len(self.errors) == 1:
             self._try_to_save(self._finished, self.run)
+
+    def _observer(
+        self, task: Task, settings: Settings, world: PushableWorld, records: list[PlanRecord]
+    ) -> Callable[[Execution], None]:
+        """Return a function that shows every step on the page at the page's speed, and appends new plans to `records`.
+
+        It raises InterruptedKickError where a client requests another kick, or none.
+        """
+        dt, reference, due_time = task.scene.dt, task.reference.states, time.monotonic()
+
+        def observe(execution: Execution) -> None:
+            nonlocal due_time
+            step = len(execution.states) - 1
+            last = plans_of(execution)[-1]
+            predicted = last.info.states if last.step == step - 1 else None
+            self.page.update(execution.states[-1], predicted, step * dt, reference[min(step, len(reference) - 1)])
+            if predicted is not None:
+                records.append(last)
+                self._show_figures(records, settings, dt)
+            due_time = due(due_time, dt / self.page.speed)
+            self.page.hold(due_time)
+            self._handle_requests(task, world)
+
+        return observe
+
+    def _handle_requests(self, task: Task, world: PushableWorld) -> None:
+        """Handle what clients request while a kick runs; raise InterruptedKickError where it ends the kick."""
+        while (request := self.page.next_request()) is not None:
+            if request.startswith("push "):
+                body = task.scene.bodies[-1 if request.endswith("ball") else 0].name
+                world.pushes.append(self.page.push(body))
+            elif request in ("reset", "kick"):
+                raise InterruptedKickError(request)
 
     def file(self, kind: str, recording: Recording) -> tuple[str, bytes]:
         """Return a recording as a file: its name and content. kind: the file's extension, such as html or png."""
@@ -283,11 +294,11 @@ class Live:
     def _window(self, task: Task) -> Callable[[int], Window]:
         """Return a function that gives a plan's window from the settings of the page when the plan is made."""
 
-        def at(step: int) -> Window:
+        def window(step: int) -> Window:
             settings = self.page.settings
             return task.window(settings.target)(step)._replace(weights=settings.terms)
 
-        return at
+        return window
 
     def _prepare(self, settings: Settings) -> Task | None:
         """Return the task for the settings and create its planners; if that fails, show why and return None."""
