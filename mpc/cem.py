@@ -86,9 +86,9 @@ class CEM:
         count = int(np.isfinite(elite_costs[: self.elites]).sum())
         if count == 0:
             return search._replace(costs=np.full(len(search.costs), np.inf, np.float32))
-        chosen = elites[:count][: self.elites]
-        mean = self.momentum * search.mean + (1 - self.momentum) * chosen.mean(axis=0)
-        spread = self.momentum * search.spread + (1 - self.momentum) * chosen.std(axis=0)
+        best = elites[:count][: self.elites]
+        mean = self.momentum * search.mean + (1 - self.momentum) * best.mean(axis=0)
+        spread = self.momentum * search.spread + (1 - self.momentum) * best.std(axis=0)
         return search._replace(
             mean=mean,
             spread=np.maximum(spread, self.floor * search.scale) if count > 1 else search.spread,

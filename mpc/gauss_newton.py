@@ -14,9 +14,9 @@ FACTORS = np.array([1e-2, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0, 1000.0])
 EXPECTED = 3
 # A step that gains more, or less, of what its quadratic promises divides, or multiplies, the next damping, down to a
 # floor; where no step gains anything it is ten times as large.
-GOOD, BAD, CHANGE, FAILED, FLOOR = 0.75, 0.25, 3.0, 10.0, 1e-6
+GOOD_SHARE, BAD_SHARE, DAMPING_FACTOR, FAILURE_FACTOR, LEAST_DAMPING = 0.75, 0.25, 3.0, 10.0, 1e-6
 # No step is longer, in spreads (root mean square over the knots).
-LONGEST = 3.0
+LONGEST_STEP = 3.0
 
 
 class Linearization(NamedTuple):
@@ -124,12 +124,14 @@ class GaussNewton:
                 linearization = Linearization(centre, expected, directions, neighbour_results)
             failed = not gain > 0.0
             if failed:
-                damping *= FAILED
+                damping *= FAILURE_FACTOR
             else:
                 knots, results = knots + steps[cheapest], evaluations.row(cheapest)
                 predicted_gain = model.gain(coordinates[cheapest])
-                damping = dampings[cheapest] * (CHANGE if gain < BAD * predicted_gain else 1.0)
-                damping = max(damping / CHANGE, FLOOR) if gain > GOOD * predicted_gain else damping
+                damping = dampings[cheapest] * (DAMPING_FACTOR if gain < BAD_SHARE * predicted_gain else 1.0)
+                damping = (
+                    max(damping / DAMPING_FACTOR, LEAST_DAMPING) if gain > GOOD_SHARE * predicted_gain else damping
+                )
             if self.differentiates:
                 linearization = Linearization(knots, results, directions, neighbour_results)
         return search
@@ -192,7 +194,7 @@ class GaussNewton:
         if not (moving.any() and np.any(steps)):
             return no_steps
         length = np.sqrt(np.mean((steps[..., moving] / scale[moving]) ** 2, axis=(1, 2)))
-        shortening = np.minimum(1.0, LONGEST / np.maximum(length, 1e-12))
+        shortening = np.minimum(1.0, LONGEST_STEP / np.maximum(length, 1e-12))
         return steps * shortening[:, None, None, None].astype(np.float32), coordinates * shortening[:, None], dampings
 
 

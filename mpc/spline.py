@@ -42,9 +42,11 @@ def shift(
 
 def _slopes(knots: jax.Array, knot_times: jax.Array) -> jax.Array:
     """Return the chord between the neighbours of each knot (K, *D) [1/s], one-sided at the ends."""
-    after = jnp.minimum(jnp.arange(len(knots)) + 1, len(knots) - 1)
-    before = jnp.maximum(jnp.arange(len(knots)) - 1, 0)
-    return (knots[after] - knots[before]) / _column(knot_times[after] - knot_times[before], knots.ndim)
+    next_knot = jnp.minimum(jnp.arange(len(knots)) + 1, len(knots) - 1)
+    previous_knot = jnp.maximum(jnp.arange(len(knots)) - 1, 0)
+    return (knots[next_knot] - knots[previous_knot]) / _column(
+        knot_times[next_knot] - knot_times[previous_knot], knots.ndim
+    )
 
 
 def _column(values: jax.Array, ndim: int) -> jax.Array:

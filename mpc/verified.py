@@ -95,18 +95,18 @@ class Verified:
         return merged(search, np.stack([validation.knots for validation in validations]), costs)
 
     @staticmethod
-    def corrected(best: Validation, problem: Problem) -> Problem:
-        """Return the problem with residuals right for the best candidate.
+    def corrected(validation: Validation, problem: Problem) -> Problem:
+        """Return the problem with its residuals corrected to those of a validated candidate.
 
-        It is the same one where the candidate is not finite in the planner's own dynamics, or in the truer ones.
+        It is the same one where the candidate's cost is not finite in the planner's own dynamics, or in the truer ones.
         """
-        if not np.isfinite(best.cost):
+        if not np.isfinite(validation.cost):
             return problem
-        model_results = problem.evaluate(best.knots[None])
+        model_results = problem.evaluate(validation.knots[None])
         if not np.isfinite(model_results.costs[0]):
             return problem
         return problem.corrected(
-            {name: residual - model_results.residuals[name] for name, residual in best.residuals.items()}
+            {name: residual - model_results.residuals[name] for name, residual in validation.residuals.items()}
         )
 
 

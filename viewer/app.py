@@ -358,7 +358,7 @@ class LivePage:
             if self._stage is None:
                 return None
             camera = self._stage.camera(view, aspect)
-            return camera.position, self._stage.middle(camera)
+            return camera.position, self._stage.look_at_point(camera)
 
     def _draw_recording(self, recording: Recording, elapsed: float) -> None:
         stage = self._stage

@@ -28,7 +28,7 @@ from viewer.recording import Approach, Recording, nearest_approach
 from viewer.scene_view import BALL_PATCHES, GROUND_TRUTH, PREDICTION, TARGET, Colour, football_meshes, link_colour
 
 SUFFIXES = (".mp4", ".gif")
-SLOW = 0.25  # playback speed up to the target, as a fraction of real time
+SLOW_SPEED = 0.25  # playback speed up to the target, as a fraction of real time
 SLOW_AFTER = 0.1  # s after the closest approach during which playback stays slow
 DOTS = 100  # per inch
 NEAR, FAR = 0.5, 20.0  # m, between which the ground is drawn
@@ -92,7 +92,7 @@ def frames(recording: Recording, size: tuple[int, int] = (1280, 720), rate: floa
     canvas.draw()
     ground = canvas.copy_from_bbox(figure.bbox)
     _clear(axes)
-    for time in _times(recording, approach, rate):
+    for time in _frame_times(recording, approach, rate):
         canvas.restore_region(ground)
         _draw_scene(axes, camera, recording, approach, time)
         axes.draw(canvas.get_renderer())
@@ -106,10 +106,10 @@ def _clear(axes: Axes) -> None:
         artist.remove()
 
 
-def _times(recording: Recording, approach: Approach, rate: float) -> Iterator[float]:
+def _frame_times(recording: Recording, approach: Approach, rate: float) -> Iterator[float]:
     """Yield the times [s] in the recording of the film's frames."""
     slow = min(approach.row * recording.scene.dt + SLOW_AFTER, recording.duration)
-    yield from np.arange(0.0, slow, SLOW / rate)
+    yield from np.arange(0.0, slow, SLOW_SPEED / rate)
     yield from np.arange(slow, recording.duration, 1.0 / rate)
 
 
@@ -157,7 +157,9 @@ def _draw_scene(axes: Axes, camera: PictureCamera, recording: Recording, approac
     if row > approach.row:
         _draw_miss(axes, camera, approach, target)
     slow = time < approach.row * recording.scene.dt + SLOW_AFTER
-    _draw_captions(axes, recording.title or "Kick", f"{time:.2f} s" + (f", at {SLOW:g} of its speed" if slow else ""))
+    _draw_captions(
+        axes, recording.title or "Kick", f"{time:.2f} s" + (f", at {SLOW_SPEED:g} of its speed" if slow else "")
+    )
 
 
 def _capsule_ends(link: Link, state: np.ndarray) -> np.ndarray:
@@ -194,8 +196,8 @@ def _draw_links(axes: Axes, camera: PictureCamera, scene: Scene, state: np.ndarr
     for index, link in enumerate(scene.links):
         if index != ball:
             ends = _capsule_ends(link, state[index])
-            lit = _hull(camera, ends + link.radius * towards_light, 0.55 * link.radius)
-            outline, colour = _hull(camera, ends, link.radius), _rgb(link_colour(link))
+            lit = _capsule_outline(camera, ends + link.radius * towards_light, 0.55 * link.radius)
+            outline, colour = _capsule_outline(camera, ends, link.radius), _rgb(link_colour(link))
             capsules.append((float(camera.depth(ends).mean()), outline, colour, lit))
     ball_depth = camera.depth(state[ball, POSITION])
     capsules.sort(key=lambda capsule: -capsule[0])
@@ -247,20 +249,20 @@ def _draw_ball(axes: Axes, camera: PictureCamera, state: np.ndarray, radius: flo
     axes.add_collection(PolyCollection(patches, facecolors=[dark], edgecolors=[dark], lw=0.3, zorder=3.81))
 
 
-def _hull(camera: PictureCamera, ends: np.ndarray, radius: float) -> np.ndarray:
+def _capsule_outline(camera: PictureCamera, ends: np.ndarray, radius: float) -> np.ndarray:
     """Return the outline (P, 2), in the picture, of a capsule between ends (2, 3) [m]."""
     discs = [camera.sphere(end, radius) for end in ends]
-    return _wrapped(np.concatenate([middle + size * CIRCLE for middle, size in discs]))
+    return _convex_outline(np.concatenate([middle + size * CIRCLE for middle, size in discs]))
 
 
 def _shadow(camera: PictureCamera, ends: np.ndarray, radius: float) -> np.ndarray:
     """Return the outline (P, 2), in the picture, of the shadow that a capsule casts on the ground."""
     on_ground = ends + np.maximum(ends[:, 2:], 0.0) * LIGHT
     discs = np.concatenate([end[:2] + radius * CIRCLE for end in on_ground])
-    return _wrapped(camera(np.pad(discs, ((0, 0), (0, 1)))))
+    return _convex_outline(camera(np.pad(discs, ((0, 0), (0, 1)))))
 
 
-def _wrapped(points: np.ndarray) -> np.ndarray:
+def _convex_outline(points: np.ndarray) -> np.ndarray:
     outline: np.ndarray = points[ConvexHull(points).vertices]
     return outline
 

@@ -12,9 +12,9 @@ from viewer.checked import vector
 from viewer.settings import Offer
 
 SIZE = 0.45  # m, of a handle's arrows
-LEAD = 0.3  # s: an arrow ends where the ball would be after this time
+ARROW_TIME = 0.3  # s: an arrow ends where the ball would be after this time
 # Offset [m] of the handle of the rolling velocity from the end of the arrow, clear of the handle of the spot.
-ABOVE = np.array([0.0, 0.0, 0.35])
+ROLL_HANDLE_OFFSET = np.array([0.0, 0.0, 0.35])
 ROLLING, FAINT = (204, 121, 167), (140, 190, 170)
 
 
@@ -66,7 +66,7 @@ class Handles:
         elif name == "spot":
             self.spot = self._clip_flat(np.asarray(position) - self._ball, offer.spot)
         else:
-            self.roll = self._clip_flat((np.asarray(position) - self.ball_position) / LEAD, offer.roll)
+            self.roll = self._clip_flat((np.asarray(position) - self.ball_position) / ARROW_TIME, offer.roll)
         self._draw_arrow()
 
     @staticmethod
@@ -79,13 +79,13 @@ class Handles:
         with self._server.atomic():
             self._target.position = np.array(self.target)
             self._spot.position = ball_position
-            self._roll.position = ball_position + LEAD * np.array((*self.roll, 0.0)) + ABOVE
+            self._roll.position = ball_position + ARROW_TIME * np.array((*self.roll, 0.0)) + ROLL_HANDLE_OFFSET
         self._draw_arrow()
 
     def _draw_arrow(self) -> None:
         """Draw the rolling velocity of the ball as an arrow, or none below 0.1 m/s."""
         begin = self.ball_position
-        end = begin + LEAD * np.array((*self.roll, 0.0))
+        end = begin + ARROW_TIME * np.array((*self.roll, 0.0))
         if np.linalg.norm(self.roll) < 0.1:
             self._server.scene.remove_by_name("/handles/rolling")
         else:

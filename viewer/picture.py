@@ -49,32 +49,32 @@ def kick_picture(recording: Recording, costs: Mapping[str, Sequence[float]] | No
     entries = [f"{name}  {text}" for name, text in facts.items()]
     for line, begin in enumerate(range(0, len(entries), FACTS)):
         figure.text(0.02, 0.925 - 0.025 * line, "     ".join(entries[begin : begin + FACTS]), fontsize=12, color=QUIET)
-    _strip(figure.add_axes((0.02, 0.56, 0.96, 0.35)), recording)
+    _draw_strip(figure.add_axes((0.02, 0.56, 0.96, 0.35)), recording)
     width = 0.56 if terms else 0.92
-    _paths(figure.add_axes((0.05, 0.31, width, 0.2)), figure.add_axes((0.05, 0.06, width, 0.2)), recording)
+    _draw_paths(figure.add_axes((0.05, 0.31, width, 0.2)), figure.add_axes((0.05, 0.06, width, 0.2)), recording)
     if terms:
-        _costs(figure.add_axes((0.68, 0.06, 0.3, 0.45 - 0.025 * ((len(terms) + 1) // 2))), terms)
+        _draw_costs(figure.add_axes((0.68, 0.06, 0.3, 0.45 - 0.025 * ((len(terms) + 1) // 2))), terms)
     buffer = io.BytesIO()
     canvas.print_png(buffer)
     write_whole(path, buffer.getvalue())
 
 
-def _strip(axes: Axes, recording: Recording) -> None:
+def _draw_strip(axes: Axes, recording: Recording) -> None:
     """Draw the scene from its right-hand side at a few times, each frame centred on the root of its first body."""
-    rows = _moments(recording)
+    rows = _drawn_rows(recording)
     for tile, (row, name) in enumerate(rows.items()):
         state = recording.states[row]
         shift = np.array([TILE * tile - state[0, 0], 0.0])
         predicted, reference = recording.predicted_at(row), recording.reference_at(row)
         outline = predicted if recording.reference is None else reference
         if outline is not None:
-            _outline(axes, recording.scene, outline, shift, "#8a93a0")
-        _bodies(axes, recording.scene, state, shift, tile)
+            _draw_outline(axes, recording.scene, outline, shift, "#8a93a0")
+        _draw_bodies(axes, recording.scene, state, shift, tile)
         if predicted is not None:
             centre = predicted[recording.traced, POSITION][[0, 2]] + shift
             if abs(centre[0] - TILE * tile) < 0.5 * TILE:
                 style = {"fill": False, "ec": _hex(PREDICTION), "lw": 1.5, "ls": "--", "zorder": 4}
-                _disc(axes, centre, recording.radius, **style)
+                _draw_disc(axes, centre, recording.radius, **style)
         label = f"{name}  {row * recording.scene.dt:.2f} s".strip()
         axes.text(TILE * tile, -0.12, label, ha="center", va="top", fontsize=12)
     axes.axhline(0.0, color=QUIET, lw=1.0, zorder=0)
@@ -90,7 +90,7 @@ def _strip(axes: Axes, recording: Recording) -> None:
         axes.text(1.0, 1.0, label, transform=axes.transAxes, ha="right", color=QUIET)
 
 
-def _moments(recording: Recording) -> dict[int, str]:
+def _drawn_rows(recording: Recording) -> dict[int, str]:
     """Return rows to draw, with their names: around contact, or evenly spread and unnamed if there is none."""
     last = len(recording.states) - 1
     speed = np.linalg.norm(recording.states[:, recording.traced, VELOCITY], axis=-1)
@@ -101,31 +101,31 @@ def _moments(recording: Recording) -> dict[int, str]:
     return {0: "start", **{row: name for row, name in rows.items() if 0 < row <= last}}
 
 
-def _bodies(axes: Axes, scene: Scene, state: np.ndarray, shift: np.ndarray, tile: int) -> None:
-    balls = _balls(scene)
+def _draw_bodies(axes: Axes, scene: Scene, state: np.ndarray, shift: np.ndarray, tile_index: int) -> None:
+    ball_rows = _ball_rows(scene)
     for row in np.argsort(-state[:, 1]):  # far links first: the eye is at y = -infinity
         centre = state[row, 0] + shift[0]
-        if abs(centre - TILE * tile) > 0.55 * TILE:
+        if abs(centre - TILE * tile_index) > 0.55 * TILE:
             continue
-        colour = (1.0, 1.0, 1.0) if row in balls else _hex(link_colour(scene.links[row]))
-        edge = "#26282e" if row in balls else "white"
-        outline = _capsule(scene, state, int(row)) + shift
+        colour = (1.0, 1.0, 1.0) if row in ball_rows else _hex(link_colour(scene.links[row]))
+        edge = "#26282e" if row in ball_rows else "white"
+        outline = _capsule_contour(scene, state, int(row)) + shift
         axes.add_patch(Polygon(outline, facecolor=colour, edgecolor=edge, lw=1.0, zorder=3))
 
 
-def _outline(axes: Axes, scene: Scene, state: np.ndarray, shift: np.ndarray, colour: str) -> None:
+def _draw_outline(axes: Axes, scene: Scene, state: np.ndarray, shift: np.ndarray, colour: str) -> None:
     """Draw the contour of all bodies but balls: thick edges, then white areas over the edges that lie inside."""
-    for row in set(range(len(scene.links))) - _balls(scene):
-        contour = _capsule(scene, state, row) + shift
+    for row in set(range(len(scene.links))) - _ball_rows(scene):
+        contour = _capsule_contour(scene, state, row) + shift
         axes.add_patch(Polygon(contour, facecolor="none", edgecolor=colour, lw=3.0, zorder=1))
         axes.add_patch(Polygon(contour, facecolor="white", edgecolor="none", zorder=2))
 
 
-def _balls(scene: Scene) -> set[int]:
+def _ball_rows(scene: Scene) -> set[int]:
     return {scene.rows(body.name).start for body in scene.bodies if body.is_ball}
 
 
-def _capsule(scene: Scene, state: np.ndarray, row: int, points: int = 24) -> np.ndarray:
+def _capsule_contour(scene: Scene, state: np.ndarray, row: int, points: int = 24) -> np.ndarray:
     """Return the contour (P, 2) [m] of a link in the x-z plane."""
     link = scene.links[row]
     along = Rotation.from_quat(state[row, ORIENTATION], scalar_first=True).apply(link.axis)[[0, 2]]
@@ -136,7 +136,7 @@ def _capsule(scene: Scene, state: np.ndarray, row: int, points: int = 24) -> np.
     return contour
 
 
-def _paths(above: Axes, beside: Axes, recording: Recording) -> None:
+def _draw_paths(above: Axes, beside: Axes, recording: Recording) -> None:
     """Draw both paths over the distance towards the target, to one scale.
 
     above, beside: axes for the sideways offset and for the height.
@@ -164,9 +164,9 @@ def _paths(above: Axes, beside: Axes, recording: Recording) -> None:
         axes.plot(*path[:, planes].T, color=_hex(GROUND_TRUTH), lw=2.5, label="truth")
         if predicted is not None:
             axes.plot(*predicted[:, planes].T, color=_hex(PREDICTION), lw=2.0, ls="--", label="prediction")
-        _disc(axes, goal[planes], recording.radius, color=_hex(TARGET), alpha=0.5, lw=0, label="target")
+        _draw_disc(axes, goal[planes], recording.radius, color=_hex(TARGET), alpha=0.5, lw=0, label="target")
         for point in (path[0], nearest):
-            _disc(axes, point[planes], recording.radius, fill=False, ec=_hex(GROUND_TRUTH), lw=1.2)
+            _draw_disc(axes, point[planes], recording.radius, fill=False, ec=_hex(GROUND_TRUTH), lw=1.2)
         axes.plot(*np.stack([nearest, goal])[:, planes].T, color="black", lw=1.2)
         bottom = low[2] if row == 2 else 0.5 * (low[1] + high[1] - scale * height)
         # Away from the path, and from the title above.
@@ -182,7 +182,7 @@ def _paths(above: Axes, beside: Axes, recording: Recording) -> None:
         )
         axes.set_xlim(low[0], low[0] + scale * width)
         axes.set_ylim(bottom, bottom + scale * height)
-        _plain(axes)
+        _set_plain_style(axes)
     above.set_title("Ball from above", loc="left", fontsize=13)
     above.set_ylabel("to the left [m]")
     beside.axhline(0.0, color=QUIET, lw=1.0)
@@ -198,7 +198,7 @@ def _positive(values: Sequence[float]) -> np.ndarray:
     return np.where((costs > 0.0) & np.isfinite(costs), costs, np.nan)
 
 
-def _costs(axes: Axes, terms: Mapping[str, np.ndarray]) -> None:
+def _draw_costs(axes: Axes, terms: Mapping[str, np.ndarray]) -> None:
     """Plot the cost terms, as `_positive` returns them, over the replans."""
     for (name, values), colour, marker in zip(terms.items(), cycle(PALETTE), cycle("osD^vP"), strict=False):
         axes.plot(np.arange(1, len(values) + 1), values, color=colour, marker=marker, ms=4, lw=1.5, label=name)
@@ -210,14 +210,14 @@ def _costs(axes: Axes, terms: Mapping[str, np.ndarray]) -> None:
     axes.set_xlabel("replan")
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False, fontsize=11)
     axes.figure.text(0.68, 0.525, "Cost of the plan, by term", fontsize=13)
-    _plain(axes)
+    _set_plain_style(axes)
 
 
-def _disc(axes: Axes, centre: np.ndarray, radius: float, **style: Any) -> None:
+def _draw_disc(axes: Axes, centre: np.ndarray, radius: float, **style: Any) -> None:
     axes.add_patch(Circle((float(centre[0]), float(centre[1])), radius, **style))
 
 
-def _plain(axes: Axes) -> None:
+def _set_plain_style(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(True, color="#e3e6ea", lw=0.8)
     axes.set_axisbelow(True)

@@ -26,8 +26,8 @@ from websockets.http11 import Request, Response
 from larp_model.errors import InputError
 from viewer.checked import has_type_of
 
-RESOLVING = 1.5  # s until a host's name must be resolved
-PATIENCE = 0.5  # s for clients to acknowledge that the server closes
+RESOLVE_TIMEOUT = 1.5  # s until a host's name must be resolved
+CLOSE_TIMEOUT = 0.5  # s for clients to acknowledge that the server closes
 LARGEST_MESSAGE = 2**20  # bytes of a client's message; usual ones have a few hundred
 
 # Messages that Viser accepts from clients, for features that no page of this viewer offers.
@@ -69,13 +69,13 @@ def open_server(host: str = "127.0.0.1", port: int = 8080, allowed: Sequence[str
     would move to another port, or try for ever.
     """
     proxies = _check_names(allowed)
-    listening = _listen(host, port)
-    local = is_loopback(listening.getsockname()[0])
+    listening_socket = _listen(host, port)
+    local = is_loopback(listening_socket.getsockname()[0])
     try:
         with redirect_stdout(io.StringIO()):
-            server = _Server(host, listening, local, proxies)
+            server = _Server(host, listening_socket, local, proxies)
     except BaseException:
-        listening.close()
+        listening_socket.close()
         raise
     if not local:
         print(f"host {host}: anyone who reaches this machine can use the page", file=sys.stderr)
@@ -154,11 +154,11 @@ class _Server(viser.ViserServer):
     Viser has no hook for this, so during its start `serve` of websockets is replaced by one that adds the checks.
     """
 
-    def __init__(self, host: str, listening: socket.socket, local: bool, proxies: frozenset[str]) -> None:
+    def __init__(self, host: str, listening_socket: socket.socket, local: bool, proxies: frozenset[str]) -> None:
         """Start the server on a socket.
 
-        listening: socket that is bound to the host; `stop` closes it. local: whether only this machine reaches the
-        host. proxies: see `admits`.
+        listening_socket: bound to the host; `stop` closes it. local: whether only this machine reaches the host.
+        proxies: see `admits`.
         """
         names = names_of(host, local)
         self._websocket_serve: listener.serve | None = None
@@ -173,12 +173,12 @@ class _Server(viser.ViserServer):
                 options["create_connection"] = _Connection
                 options["max_size"] = LARGEST_MESSAGE
                 options["logger"] = logging.Logger("viewer", logging.CRITICAL)  # or strangers write to our terminal
-                self._websocket_serve = serve(handler, sock=listening, **options)
+                self._websocket_serve = serve(handler, sock=listening_socket, **options)
                 return self._websocket_serve
 
             listener.serve = checked_serve  # type: ignore[assignment,misc]
             try:
-                super().__init__(host, listening.getsockname()[1], verbose=False)
+                super().__init__(host, listening_socket.getsockname()[1], verbose=False)
             finally:
                 listener.serve = serve  # type: ignore[misc]
         if self._websocket_serve is None:
@@ -194,7 +194,7 @@ class _Server(viser.ViserServer):
         if self._websocket_serve is not None:
             loop = self._websocket_serve.server.loop
             with suppress(RuntimeError):  # it is closed already
-                loop.call_soon_threadsafe(loop.call_later, PATIENCE, self._cut_off)
+                loop.call_soon_threadsafe(loop.call_later, CLOSE_TIMEOUT, self._cut_off)
         super().stop()
 
     def request_share_url(self, verbose: bool = True) -> None:
@@ -268,7 +268,7 @@ def _resolve(host: str, port: int) -> tuple[socket.AddressFamily, Any]:
 
     thread = threading.Thread(target=resolve, daemon=True)
     thread.start()
-    thread.join(RESOLVING)
+    thread.join(RESOLVE_TIMEOUT)
     if not results or isinstance(results[0], Exception):
         raise OSError(results[0] if results else "nobody knows it")
     family, _, _, _, address = min(results, key=lambda result: result[0] != socket.AF_INET)

@@ -25,15 +25,15 @@ class Lane:
     """Drawing of one kick: ground truth, prediction and reference as ghosts, both paths, target and miss."""
 
     def __init__(
-        self, server: viser.ViserServer, scene: Scene, name: str, target: np.ndarray, traced: int, aside: float = 0.0
+        self, server: viser.ViserServer, scene: Scene, name: str, target: np.ndarray, traced: int, offset_y: float = 0.0
     ) -> None:
         """Add the lane to the scene.
 
-        name: in Viser's tree. target: (3,) [m]. traced: row of the link whose path is drawn. aside: offset along y [m].
+        name: in Viser's tree. target: (3,) [m]. traced: row of the link whose path is drawn. offset_y: of the lane [m].
         """
         self._server, self._name, self._traced = server, name, traced
         self._radius = scene.links[traced].radius
-        self._root = server.scene.add_frame(name, show_axes=False, position=(0.0, aside, 0.0))
+        self._root = server.scene.add_frame(name, show_axes=False, position=(0.0, offset_y, 0.0))
         self._ball = server.scene.add_icosphere(
             f"{name}/target", self._radius, TARGET, opacity=0.45, cast_shadow=False, receive_shadow=False
         )
@@ -143,14 +143,14 @@ class Stage:
             self.lane = Lane(server, scene, "/kick", target, traced)
         self.beside: Lane | None = None
 
-    def compare(self, target: np.ndarray | None, aside: float = -2.5) -> Lane | None:
-        """Add and return a second lane for another kick, `aside` along y [m]; with no target, remove the old one."""
+    def compare(self, target: np.ndarray | None, offset_y: float = -2.5) -> Lane | None:
+        """Replace the second lane, `offset_y` [m] beside the first, by one with this target, or by none; return it."""
         if self.beside is not None:
             self.beside.remove()
             self.beside = None
         if target is not None:
             with self._server.atomic():
-                self.beside = Lane(self._server, self.scene, "/beside", target, self._traced, aside)
+                self.beside = Lane(self._server, self.scene, "/beside", target, self._traced, offset_y)
         return self.beside
 
     def frame(self, points: np.ndarray) -> None:
@@ -158,13 +158,13 @@ class Stage:
         self._visible_points = around(points)
         camera = self.camera("side", 1.6)
         initial = self._server.initial_camera
-        initial.fov, initial.position, initial.look_at = FIELD_OF_VIEW, camera.position, self.middle(camera)
+        initial.fov, initial.position, initial.look_at = FIELD_OF_VIEW, camera.position, self.look_at_point(camera)
 
     def camera(self, view: View, aspect: float) -> PictureCamera:
         """Return the camera that sees all points set by `frame`. aspect: width over height of its picture."""
         return PictureCamera.of(self._visible_points, 1.0 / aspect, view, float(np.tan(0.5 * FIELD_OF_VIEW)) * aspect)
 
-    def middle(self, camera: PictureCamera) -> np.ndarray:
+    def look_at_point(self, camera: PictureCamera) -> np.ndarray:
         """Return the point (3,) [m] that a camera orbits: on its axis, at the mean depth of the points of `frame`."""
         depth = float(camera.depth(self._visible_points).mean())
         return np.asarray(camera.position + depth * camera.axes[2])
