@@ -9,7 +9,7 @@ PYTHON ?= $(shell for python in python3 python3.11 python3.12 python3.13; do \
 RUN := .venv/bin/python -m
 READY := .venv/ready
 
-.PHONY: setup test lint kick view train bench clean
+.PHONY: setup test lint docs kick view train bench clean
 
 setup: $(READY)
 
@@ -31,6 +31,10 @@ lint: $(READY)
 	$(RUN) ruff check
 	$(RUN) ruff format --check
 	$(RUN) mypy
+
+# The documentation, to be read from site/index.html.
+docs: $(READY)
+	$(RUN) mkdocs build --strict
 
 kick: $(READY)
 	@$(RUN) tasks.kick
@@ -70,5 +74,5 @@ bench: $(READY)
 
 # Keeps runs/: results are never thrown away by a clean-up.
 clean:
-	rm -rf .venv build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv build site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
