@@ -56,7 +56,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 def examples() -> str:
     """Return the page of all examples: what each says of itself, and its source."""
-    parts = ["# Examples", "Each example asserts its own outcome and is run by the tests."]
+    parts = ["# Examples", "Each program asserts its own outcome. All are run by the tests."]
     for path in sorted((ROOT / "examples").glob("*.py")):
         source = path.read_text()
         text = ast.get_docstring(ast.parse(source)) or ""
