@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from viewer.checked import alike, flag, option, vector, within
+from viewer.checked import flag, has_type_of, option, vector, within
 
 anything = st.one_of(
     st.none(), st.booleans(), st.integers(), st.floats(), st.text(), st.lists(st.floats()), st.binary(),
@@ -65,7 +65,7 @@ def test_a_flag_is_true_only_where_it_is_true(value: object) -> None:
 @given(anything, st.sampled_from([True, 1, 1.0, "text", (0.0, 0.0), (), None]))
 def test_what_may_stand_for_a_value_is_of_its_kind_and_can_be_sent_to_all(value: object, current: object) -> None:
     kinds = {bool: bool, int: (int, float), float: (int, float), str: str, tuple: list}
-    if alike(value, current):
+    if has_type_of(value, current):
         assert isinstance(value, kinds[type(current)])  # type: ignore[arg-type]
         msgspec.msgpack.encode(int(value) if type(current) is int else value)  # type: ignore[call-overload]
 
@@ -74,4 +74,4 @@ def test_what_may_stand_for_a_value_is_of_its_kind_and_can_be_sent_to_all(value:
     ("value", "current"), [(False, True), (2.5, 1), (2, 1.0), ("", "text"), ([1, 2.5], (0.0, 0.0)), ([], ())]
 )
 def test_what_a_browser_sends_of_a_control_may_stand_for_its_value(value: object, current: object) -> None:
-    assert alike(value, current)
+    assert has_type_of(value, current)

@@ -261,8 +261,8 @@ def test_gradient_equals_finite_differences() -> None:
 def test_cem_update_ignores_what_is_not_finite() -> None:
     cem, search = CEM(samples=32, elites=6), _search()
     candidates = cem.sample(search, np.random.default_rng(0), 32, last=True)
-    np.testing.assert_array_equal(candidates[: cem.kept], search.elites[: cem.kept])
-    np.testing.assert_array_equal(candidates[cem.kept], search.mean)
+    np.testing.assert_array_equal(candidates[: cem.retained], search.elites[: cem.retained])
+    np.testing.assert_array_equal(candidates[cem.retained], search.mean)
 
     lost = np.full(32, np.inf)
     unchanged = cem.update(search, candidates, lost)

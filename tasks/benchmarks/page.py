@@ -207,7 +207,7 @@ def measure(settings: PageSettings, json: Path) -> tuple[dict[str, report.Row], 
         wait_until(lambda: page.mode == "planned", 300.0)
         watching, visits = watchers(page, settings.clients, process)
         for _ in range(WARM_UP):
-            kick_row(live, partial(page.ask, "kick"))
+            kick_row(live, partial(page.request, "kick"))
         memory = process.memory_info().rss
         jobs = jobs_of(live, session, targets, settings)
         rows = dict(zip(jobs, report.collect(json, settings.command, jobs), strict=True))
@@ -246,7 +246,7 @@ def jobs_of(
     jobs: dict[str, Callable[[], report.Row]] = {}
     for index, target in enumerate(targets):
         jobs[f"drag {index}"] = partial(drag_row, live, target)
-        jobs[f"watched {index}"] = partial(kick_row, live, partial(live.page.ask, "kick"))
+        jobs[f"watched {index}"] = partial(kick_row, live, partial(live.page.request, "kick"))
         if index < settings.alone:
             jobs[f"alone {index}"] = partial(unwatched_row, live, session, target, settings.preset, settings.seed)
     return jobs
