@@ -9,7 +9,7 @@ PYTHON ?= $(shell for python in python3 python3.11 python3.12 python3.13; do \
 RUN := .venv/bin/python -m
 READY := .venv/ready
 
-.PHONY: setup test lint docs kick view train bench clean
+.PHONY: setup test quick lint docs kick view train bench clean
 
 setup: $(READY)
 
@@ -26,6 +26,9 @@ $(READY): pyproject.toml constraints.txt
 # Two at a time: most of it is compilation, which keeps one core busy.
 test: $(READY)
 	@$(RUN) pytest -n 2 --dist loadfile tests
+
+quick: $(READY)
+	@$(RUN) pytest -n 2 --dist loadfile -m "not slow" tests
 
 lint: $(READY)
 	$(RUN) ruff check

@@ -29,7 +29,7 @@ class Gentle(Kick):
 
         def pace(states: Array, controls: Array, context: Any) -> Array:
             speeds = jnp.linalg.norm(states[:, self.ball, packed.VELOCITY], axis=-1)
-            return speeds.max(keepdims=True) - self.speed
+            return jnp.max(speeds, keepdims=True) - self.speed
 
         return (CostTerm("pace", pace, quadratic, weight=0.5),)
 

@@ -42,7 +42,7 @@ class InWind:
 def main() -> None:
     """Kick in the wind with a model without it, and with one that has it and misses by less than half as much."""
     kick = Kick.standard()
-    ours = models_of(kick.scene, "larp").whole
+    ours = models_of(kick.scene, "larp").scene
     knowing = InWind(ours, kick.ball, kick.scene.links[kick.ball].radius + 0.01, kick.scene.dt)
     blind, aware = (Session(kick, model).run(TARGET, "fast", world=Windy(kick)) for model in ("larp", knowing))
     print(f"missed by {100 * blind.truth_error_m:.1f} cm without, {100 * aware.truth_error_m:.1f} cm with the wind")

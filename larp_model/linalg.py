@@ -16,7 +16,7 @@ Arrays = TypeVar("Arrays")
 
 def barrier(arrays: Arrays) -> Arrays:
     """Return arrays as they are; XLA computes them before it uses them, once, and moves nothing across."""
-    same: Arrays = jax.lax.optimization_barrier(arrays)  # type: ignore[no-untyped-call]
+    same: Arrays = jax.lax.optimization_barrier(arrays)
     return same
 
 

@@ -43,8 +43,8 @@ def remember_compilations() -> None:
         discard_unreadable(folder)
     except (RuntimeError, OSError):  # RuntimeError: the user has no home
         return
-    jax.config.update("jax_compilation_cache_dir", str(folder))  # type: ignore[no-untyped-call]
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)  # type: ignore[no-untyped-call]
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
 def discard_unreadable(folder: Path) -> None:

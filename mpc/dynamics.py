@@ -63,7 +63,7 @@ class MujocoDynamics:
     def rollout(self, state: jax.Array, controls: jax.Array, *, steps: jax.Array | None = None) -> jax.Array:
         """Return the states of `Dynamics.rollout`; H' = H."""
         shape = (*controls.shape[:2], *state.shape[1:])
-        result = jax.ShapeDtypeStruct(shape, jnp.float32)  # type: ignore[no-untyped-call]
+        result = jax.ShapeDtypeStruct(shape, jnp.float32)
         count = controls.shape[1] if steps is None else steps
         states: jax.Array = jax.pure_callback(self._simulate, result, state, controls, count)
         return states

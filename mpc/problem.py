@@ -126,7 +126,7 @@ class Programs:
             begin = time.perf_counter()
             self._compiled[signature] = jax.jit(function).lower(*arguments).compile()
             self.seconds += time.perf_counter() - begin
-        return jax.block_until_ready(self._compiled[signature](*arguments))  # type: ignore[no-untyped-call]
+        return jax.block_until_ready(self._compiled[signature](*arguments))
 
 
 @dataclass

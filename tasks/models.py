@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
@@ -27,14 +26,16 @@ DynamicsName = Literal["larp", "mujoco"]
 
 
 class Models(NamedTuple):
-    """Planners' models of the scene and of the human alone.
+    """Planners' models of a scene and of its human alone.
 
-    exact: whether they are MuJoCo itself, so that there is nothing to verify in it. weights: the beginning of their
-    hash, or `NO_WEIGHTS`.
+    scene: goes on with the ball alone once no link can reach it any more; see `with_flight`. simulator: of the scene
+    without that, where LARP is the model. exact: whether they are MuJoCo itself, which needs no validation in it.
+    weights: the beginning of their hash, or `NO_WEIGHTS`.
     """
 
-    whole: Dynamics
+    scene: Dynamics
     human: Dynamics
+    simulator: Simulator | None
     exact: bool
     weights: str
 
@@ -43,16 +44,15 @@ class Models(NamedTuple):
 
         See `larp_model.evaluation.novelty`.
         """
-        simulator = self.whole.dynamics if isinstance(self.whole, Continued) else self.whole
-        if not (isinstance(simulator, Simulator) and simulator.weights.networks):
+        if self.simulator is None or not self.simulator.weights.networks:
             return None
-        return evaluation.novelty(simulator, states, controls)
+        return evaluation.novelty(self.simulator, states, controls)
 
 
 def models_of(
     scene: Scene, name: DynamicsName, weights: Path | None = None, substeps: int = SUBSTEPS, rows: int = ROWS
 ) -> Models:
-    """Return the planners' models; that of the scene goes on with the ball alone once no link can reach it any more.
+    """Return the planners' models.
 
     name: larp, with these weights or with nothing learned, or mujoco, the ground truth itself. substeps: engine steps
     in a step of MuJoCo. rows: candidates that it rolls out side by side.
@@ -61,15 +61,17 @@ def models_of(
     human, ball = scene.bodies[0].name, scene.bodies[-1].name
     parts = scene.only(human, ball), scene.only(ball), scene.only(human)
     if name == "mujoco":
-        return _continued(scene, [MujocoDynamics(Truth(part, rows, substeps)) for part in parts], True, NO_WEIGHTS)
+        engines = [MujocoDynamics(Truth(part, rows, substeps)) for part in parts]
+        return Models(with_flight(scene, engines[0], engines[1]), engines[2], None, True, NO_WEIGHTS)
+    label = NO_WEIGHTS
     if weights is None:
-        return _continued(scene, [Simulator.of_physics(part) for part in parts], False, NO_WEIGHTS)
-    model, learned, manifest = stored.load(weights, scene)
-    simulators = [Simulator.of(model.on(part), learned) for part in parts]
-    return _continued(scene, simulators, False, manifest["sha256"][:12])
+        simulators = [Simulator.of_physics(part) for part in parts]
+    else:
+        model, learned, manifest = stored.load(weights, scene)
+        simulators, label = [Simulator.of(model.on(part), learned) for part in parts], manifest["sha256"][:12]
+    return Models(with_flight(scene, simulators[0], simulators[1]), simulators[2], simulators[0], False, label)
 
 
-def _continued(scene: Scene, models: Sequence[Dynamics], exact: bool, weights: str) -> Models:
-    scene_model, ball_model, human_model = models
-    rest = slice(scene.rows(scene.bodies[0].name).stop, None)
-    return Models(Continued(scene_model, ball_model, rest, FLIGHT), human_model, exact, weights)
+def with_flight(scene: Scene, scene_model: Dynamics, ball_model: Dynamics) -> Dynamics:
+    """Return dynamics of a scene that follow the ball alone for `FLIGHT` more steps."""
+    return Continued(scene_model, ball_model, slice(scene.rows(scene.bodies[0].name).stop, None), FLIGHT)

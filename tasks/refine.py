@@ -16,7 +16,6 @@ import dataclasses
 import time
 from pathlib import Path
 
-import cma
 import numpy as np
 from rich.console import Console
 
@@ -179,6 +178,10 @@ def main(
     for name, value, least in (("rounds", rounds, 1), ("population", population, 4), ("kicks", kicks, 1)):
         if value < least:
             raise InputError(f"{name} is {value}, but must be at least {least}")
+    try:
+        import cma
+    except ModuleNotFoundError:
+        raise InputError("cma is not installed: pip install 'larp-mpc[refine]'") from None
     console, scene, random = Console(), human_and_ball(), np.random.default_rng(seed)
     authored = key_poses.load()
     mean = numbers(authored)

@@ -41,7 +41,7 @@ def measured(contact: int | None, count: int) -> tuple[int, int]:
 
 
 def summarize(task: Task, execution: Execution, goal: Any) -> dict[str, Any]:
-    """Return the figures of an execution, entries of `summary.json`; the README explains each."""
+    """Return the figures of an execution, entries of `summary.json`; docs/runs.md explains each."""
     states, plans = np.stack(execution.states), plans_of(execution)
     free = task.untouched(states[0], len(states) - 1)
     begin, end = measured(strike_step(states, free), len(states))
@@ -106,7 +106,7 @@ def facts(task: Task, summary: dict[str, Any]) -> dict[str, str]:
 class Run:
     """Result of a task that was planned and executed in the ground truth.
 
-    summary: the content of `summary.json`; see the README for each entry.
+    summary: the content of `summary.json`; docs/runs.md explains each entry.
     """
 
     task: Task

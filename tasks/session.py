@@ -61,7 +61,9 @@ class Session:
             self.dynamics, self.models = str(dynamics), models_of(task.scene, dynamics, manifest, substeps)
         else:
             self.dynamics = type(dynamics).__name__
-            self.models = models_of(task.scene, "larp", manifest)._replace(whole=dynamics, weights=NO_WEIGHTS)
+            self.models = models_of(task.scene, "larp", manifest)._replace(
+                scene=dynamics, simulator=None, weights=NO_WEIGHTS
+            )
         self._planners: dict[Preset, Planners] = {}
 
     @cached_property
@@ -70,7 +72,7 @@ class Session:
 
     @cached_property
     def _planner(self) -> Planner:
-        return self.task.planner(self.models.whole, PRESETS["fast"].first)
+        return self.task.planner(self.models.scene, PRESETS["fast"].first)
 
     @cached_property
     def _recovery(self) -> Planner:
@@ -86,13 +88,13 @@ class Session:
             stages: list[tuple[Optimizer, ...]] = [preset.first, preset.replan]
             if any(preset.verify) and not self.models.exact:
                 rows = max(2, preset.candidates)  # the warm start is validated beside the first proposal
-                truth = models_of(self.task.scene, "mujoco", substeps=self.task.substeps, rows=rows).whole
+                truth = models_of(self.task.scene, "mujoco", substeps=self.task.substeps, rows=rows).scene
                 tolerance = (("target", preset.tolerance),)
                 for stage, rounds in enumerate(preset.verify):
                     if rounds:
                         verified = Verified(truth, preset.correct, rounds, preset.candidates, tolerance)
                         stages[stage] = (*stages[stage], verified)
-            first, replan = (self._planner.using(usable(self.models.whole, stage)) for stage in stages)
+            first, replan = (self._planner.using(usable(self.models.scene, stage)) for stage in stages)
             recovery = self._recovery.using(usable(self.models.human, preset.recovery))
             self._planners[preset] = Planners(first, replan, preset.interval, recovery)
         return self._planners[preset]

@@ -49,7 +49,7 @@ class Filmed(NamedTuple):
 
 def theirs(points: np.ndarray) -> np.ndarray:
     """Points (*, 3) [m] of our world in AIST++'s, in centimetres."""
-    return 100.0 * (points + np.array([0.0, 0.0, LOWER])) @ AXES
+    return np.asarray(100.0 * (points + np.array([0.0, 0.0, LOWER])) @ AXES)
 
 
 def images(points: np.ndarray, lens: Camera) -> np.ndarray:
@@ -63,7 +63,7 @@ def images(points: np.ndarray, lens: Camera) -> np.ndarray:
         x * radial + 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x),
         y * radial + p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y,
     )
-    return np.stack(bent, axis=-1) * SPREAD + lens.centre
+    return np.asarray(np.stack(bent, axis=-1) * SPREAD + lens.centre)
 
 
 def annotated(folder: Path, points: np.ndarray, protocol: int = 4) -> Filmed:
@@ -146,7 +146,7 @@ def test_plain_values_come_back_exactly(protocol: int, tmp_path: Path) -> None:
 class Trap:
     """Calls something when it is unpickled."""
 
-    def __init__(self, call: Callable, *arguments: Any) -> None:
+    def __init__(self, call: Callable[..., Any], *arguments: Any) -> None:
         self.called = call, arguments
 
     def __reduce__(self) -> Any:

@@ -109,6 +109,7 @@ def test_only_what_is_committed_and_ships_is_published(tmp_path: Path, monkeypat
         report.ready(tmp_path / "kick.json", publish=True)
 
 
+@pytest.mark.slow
 def test_the_kick_benchmark_keeps_its_rows_and_touches_no_results(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

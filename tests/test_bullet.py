@@ -40,7 +40,7 @@ def at_rest(*positions: tuple[float, float, float]) -> np.ndarray:
 
 def apart(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Distances (*, L) of the links in two states (*, L, 13) [m]."""
-    return np.linalg.norm((first - second)[..., packed.POSITION], axis=-1)
+    return np.asarray(np.linalg.norm((first - second)[..., packed.POSITION], axis=-1))
 
 
 def same_sign(states: np.ndarray) -> np.ndarray:
@@ -59,7 +59,7 @@ def kicks(scene: Scene, reference: Reference, count: int, steps: int) -> tuple[n
 
 def standing(scene: Scene) -> np.ndarray:
     """The state (L, 13) of a human who stands in its rest pose."""
-    return standing_on_ground(scene, np.zeros((1, 12, 3)), Rotation.identity(1))[0]
+    return np.asarray(standing_on_ground(scene, np.zeros((1, 12, 3)), Rotation.identity(1))[0])
 
 
 def open_worlds() -> int:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from larp_model.engines.mujoco import SUBSTEPS, Truth
+from mpc import GaussNewton
 from tasks.episodes import candidates
 from tasks.episodes.candidates import candidate_episodes
 from tasks.kick import Kick
@@ -15,7 +16,7 @@ def task() -> Kick:
 
 
 def test_what_is_tried_is_what_happens_in_the_truth(task: Kick, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(candidates, "OPTIMIZER", candidates.GaussNewton(rounds=1, directions=6))
+    monkeypatch.setattr(candidates, "OPTIMIZER", GaussNewton(rounds=1, directions=6))
     episodes = candidate_episodes(task, kicks=2, per_plan=5, seed=3)
     assert episodes.states.shape == (10, task.horizon + 1, len(task.scene.links), 13)
     after, finite = Truth(task.scene, 10, SUBSTEPS).rollout(episodes.states[:, 0], episodes.controls)
@@ -26,12 +27,12 @@ def test_what_is_tried_is_what_happens_in_the_truth(task: Kick, monkeypatch: pyt
 
 
 def test_no_kick_is_begun_after_the_time_is_up(task: Kick, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(candidates, "OPTIMIZER", candidates.GaussNewton(rounds=1, directions=6))
+    monkeypatch.setattr(candidates, "OPTIMIZER", GaussNewton(rounds=1, directions=6))
     assert len(candidate_episodes(task, kicks=50, per_plan=4, seed=3, seconds=0.0).states) == 4
 
 
 def test_the_balls_that_are_tried_fly_where_targets_are(task: Kick, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(candidates, "OPTIMIZER", candidates.GaussNewton(rounds=3, directions=12))
+    monkeypatch.setattr(candidates, "OPTIMIZER", GaussNewton(rounds=3, directions=12))
     episodes = candidate_episodes(task, kicks=3, per_plan=1000, seed=4)
     velocity = episodes.states[:, -1, task.ball, 7:9]
     bearing = np.degrees(np.arctan2(velocity[:, 1], velocity[:, 0]))

@@ -55,7 +55,7 @@ def test_a_mistyped_name_is_answered_with_the_nearest(tmp_path: Path) -> None:
         (lambda: require_file("reference", tmp_path / "kik.bvh"), "kick.bvh"),
     ):
         with pytest.raises(InputError, match=f"did you mean '{meant}'"):
-            mistyped()  # type: ignore[no-untyped-call]
+            mistyped()
 
 
 def raising(error: BaseException) -> Callable[[], None]:

@@ -84,7 +84,7 @@ def apart(first: Segment, second: Segment) -> np.ndarray:
 
 def skew(first: Segment, second: Segment) -> np.ndarray:
     """Which pairs are neither parallel nor balls, so that their closest points are unique."""
-    return np.linalg.norm(np.cross(first.half, second.half), axis=-1) > 1e-3
+    return np.asarray(np.linalg.norm(np.cross(first.half, second.half), axis=-1) > 1e-3)
 
 
 def test_closest_points_are_as_close_as_sampling_finds() -> None:

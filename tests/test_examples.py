@@ -17,6 +17,7 @@ from larp_model.runtime import remember_compilations
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
+@pytest.mark.slow
 def test_a_task_from_outside_meets_its_goals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     runpy.run_path(str(EXAMPLES / "pass_to_runner.py"))["main"](count=1)
@@ -34,6 +35,7 @@ def test_a_task_from_outside_meets_its_goals(tmp_path: Path, monkeypatch: pytest
         ("own_scene", (1e-4, 40)),
     ],
 )
+@pytest.mark.slow
 def test_what_an_example_says_of_itself_holds(
     name: str, given: tuple[float, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -43,6 +45,7 @@ def test_what_an_example_says_of_itself_holds(
     runpy.run_path(str(EXAMPLES / f"{name}.py"))["main"](*given)
 
 
+@pytest.mark.slow
 def test_kicks_are_shared_among_processes(tmp_path: Path) -> None:
     path = tmp_path / "kicks.npz"
     subprocess.run([sys.executable, EXAMPLES / "batch.py", "2", path, "2"], check=True, capture_output=True)

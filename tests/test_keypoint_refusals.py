@@ -112,7 +112,7 @@ class NpzTrap:
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def __reduce__(self) -> tuple[Callable, tuple[str]]:
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[str]]:
         return os.mkdir, (str(self.path),)
 
 
@@ -226,7 +226,7 @@ JSON = st.recursive(
 )
 
 
-def replaced(content: Any, draw: Callable) -> Any:
+def replaced(content: Any, draw: Callable[..., Any]) -> Any:
     """The content with something else in one place."""
     inner = list(content.items()) if isinstance(content, dict) else list(enumerate(content or []))
     if not inner or draw(st.integers(0, 4)) == 0:

@@ -154,6 +154,7 @@ def test_a_kick_end_to_end_leaves_all_its_files_and_they_agree(
     assert task.missed(states, 0, np.array(summary["target"])) == pytest.approx(summary["truth_error_m"], abs=1e-3)
 
 
+@pytest.mark.slow
 def test_later_kicks_of_a_preset_compile_nothing_again(small: None) -> None:
     session = Session(kick.Kick.standard(substeps=4), "mujoco")
     first, again = (session.run((3.0, side, 0.4), "fast") for side in (0.2, -0.2))

@@ -92,6 +92,7 @@ def moved_apart(case: Case) -> np.ndarray:
     return states
 
 
+@pytest.mark.slow
 def test_bodies_that_meet_change_each_other(case: Case) -> None:
     last = case.model.scene.rows(case.model.scene.bodies[-1].name)
     change = case.after(case.states)[..., packed.VELOCITY] - case.after(moved_apart(case))[..., packed.VELOCITY]
@@ -99,6 +100,7 @@ def test_bodies_that_meet_change_each_other(case: Case) -> None:
         assert np.abs(change[:, rows]).max() > 1e-4, "without contact there would be little to test"
 
 
+@pytest.mark.slow
 def test_neither_the_order_of_bodies_nor_one_that_can_touch_nothing_changes_the_others(case: Case) -> None:
     scene = case.model.scene
     last = scene.bodies[-1]
@@ -111,6 +113,7 @@ def test_neither_the_order_of_bodies_nor_one_that_can_touch_nothing_changes_the_
     np.testing.assert_allclose(found, case.after(case.states)[:, others], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_it_does_not_matter_which_body_of_a_pair_is_named_first(case: Case) -> None:
     scene = case.model.scene
     other = case.model.on(replace(scene, pairs=tuple(pair.flipped() for pair in scene.pairs)))
@@ -133,6 +136,7 @@ def test_turning_the_world_turns_a_step_of_what_says_so(case: Case) -> None:
     assert same == case.model.invariant, "what is not invariant has to be taught by turning its data"
 
 
+@pytest.mark.slow
 def test_forward_derivatives_of_a_step_are_those_of_differences(case: Case) -> None:
     direction = np.random.default_rng(0).standard_normal(case.states.shape)
 

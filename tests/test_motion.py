@@ -108,7 +108,7 @@ def momenta(body: Body, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def energy(body: Body, states: np.ndarray) -> np.ndarray:
     """Energy (N,) [J] of motion and height."""
     length, radius, mass = np.asarray(kinematics.morphology_of(Scene((body,))), float).T
-    along, across = (np.asarray(each) for each in moments(length, radius, mass))  # type: ignore[arg-type]
+    along, across = (np.asarray(each) for each in moments(length, radius, mass))
     matrices = np.asarray(rotation.matrix(jnp.asarray(states[..., packed.ORIENTATION])))
     axis, spin = matrices @ np.array(body.links[0].axis), states[..., packed.ANGULAR_VELOCITY]
     turning = across * np.sum(spin**2, axis=-1) + (along - across) * np.sum(axis * spin, axis=-1) ** 2
@@ -192,9 +192,8 @@ def test_a_joint_that_came_apart_closes_by_its_share(body: Body) -> None:
     open_[:, 1:, 0] += 1e-3 * np.arange(1, len(body.links))
 
     def gaps(found: np.ndarray) -> np.ndarray:
-        return np.linalg.norm(
-            kinematics.displacement(scene, jnp.asarray(found), kinematics.morphology_of(scene)), axis=-1
-        )
+        apart = kinematics.displacement(scene, jnp.asarray(found), kinematics.morphology_of(scene))
+        return np.asarray(np.linalg.norm(apart, axis=-1))
 
     after = moved(open_, compiled(body)(open_, controls, torques))
     before = gaps(open_)
@@ -234,6 +233,7 @@ def test_stiff_servos_do_not_throw_a_body_in_long_steps() -> None:
     assert np.isfinite(states).all() and np.abs(states[..., packed.ANGULAR_VELOCITY]).max() < 30.0
 
 
+@pytest.mark.slow
 def test_forward_reverse_and_finite_difference_gradients_agree() -> None:
     body = chain(links=2)
     states, controls, torques = (each[:1] for each in starts(body))
@@ -322,6 +322,7 @@ def test_a_body_moves_on_the_ground_the_same_whatever_others_need_beside_it() ->
     np.testing.assert_allclose(together[:1], alone, rtol=0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_who_moves_on_the_ground_stays_within_five_millimetres_of_the_truth_for_a_fifth_of_a_second() -> None:
     chosen = scenario("any_human_alone")
     scene, (episodes, _) = chosen.scene, chosen.draw(48, 0)

@@ -113,7 +113,7 @@ def test_impulses_have_the_derivatives_of_their_differences(problem: contact.Con
             admittance=problem.admittance * (1.0 + share),
             mass=problem.mass * (1.0 - share),
         )
-        return impulses_of(moved, jnp.zeros_like(problem.velocity), 30)
+        return jnp.asarray(impulses_of(moved, jnp.zeros_like(problem.velocity), 30))
 
     zero, little = jnp.zeros(()), 1e-6
     forward = jax.jacfwd(impulses)(zero)
@@ -140,6 +140,7 @@ def test_a_ball_bounces_slides_and_rolls_as_mujocos_does() -> None:
 
 
 @pytest.mark.parametrize("body", [capsule(), chain(links=4), human()], ids=["capsule", "chain", "human"])
+@pytest.mark.slow
 def test_impulses_are_answered_at_once_as_the_engines_inertia_says(body: Body, in_64_bits: None) -> None:
     scene, links, count = Scene((body,)), len(body.links), 6
     random = np.random.default_rng(5)
@@ -193,6 +194,7 @@ def meeting_balls() -> np.ndarray:
     return states
 
 
+@pytest.mark.slow
 def test_balls_that_meet_keep_their_momentum(meeting_balls: np.ndarray) -> None:
     scene, steps = two_balls(), 4
     found = np.asarray(Simulator.of_physics(scene).rollout(meeting_balls, np.zeros((6, steps, 0, 3))))
@@ -212,6 +214,7 @@ def test_balls_that_meet_keep_their_momentum(meeting_balls: np.ndarray) -> None:
     assert struck[:-1].all() and not struck[-1], "m/s"
 
 
+@pytest.mark.slow
 def test_a_scene_moves_alike_alone_and_beside_others(
     meeting_balls: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -230,6 +233,7 @@ def test_a_scene_moves_alike_alone_and_beside_others(
         np.testing.assert_allclose(together[row], alone, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_chain_that_strikes_a_ball_on_the_ground_has_the_gradient_of_its_differences(in_64_bits: None) -> None:
     pair = Pair("chain", "ball", ("link1",), ("ball",), BALL_SURFACE)
     scene, random = Scene((chain(links=2), ball()), (pair,)), np.random.default_rng(3)
@@ -255,6 +259,7 @@ def test_a_chain_that_strikes_a_ball_on_the_ground_has_the_gradient_of_its_diffe
     np.testing.assert_allclose(jnp.sum(along * slope, axis=(1, 2)), differences, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_kicks_are_those_of_mujocos_small_steps_though_nothing_is_learned(scene: Scene, reference: Reference) -> None:
     episodes, _ = random_episodes(scene, reference, count=128, seed=5, steps=48)
     start = episodes.states[:, :1]

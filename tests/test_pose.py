@@ -45,6 +45,7 @@ def written(folder: Path, keypoints: Keypoints, **changed: Any) -> Path:
     return folder / "film.npz"
 
 
+@pytest.mark.slow
 def test_a_film_becomes_a_motion_in_mujoco_and_a_reference(film: dict[str, Any], tmp_path: Path) -> None:
     lens, out = film["lens"], tmp_path / "pose"
     at = (lens.position + 3.0 * lens.turn[2]).tolist()
@@ -66,6 +67,7 @@ def test_a_film_becomes_a_motion_in_mujoco_and_a_reference(film: dict[str, Any],
     assert moved[0] == pytest.approx(moved[1], abs=0.2)
 
 
+@pytest.mark.slow
 def test_a_reconstruction_that_was_cut_off_goes_on_as_if_it_had_not_been(
     film: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

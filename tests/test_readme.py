@@ -121,6 +121,7 @@ def names(folder: Path) -> dict[str, Any]:
     return names
 
 
+@pytest.mark.slow
 def test_the_python_of_the_readme_runs(names: dict[str, Any], folder: Path) -> None:
     assert names["run"].truth_error_m < 0.1
     assert {path.name for path in (folder / "runs/mine").iterdir()} > {"kick.html", "summary.json"}
@@ -130,6 +131,7 @@ def test_the_python_of_the_readme_runs(names: dict[str, Any], folder: Path) -> N
 @pytest.mark.parametrize(
     "page", [page for page in PAGES if page != QUICKSTART and blocks(page, "python")], ids=lambda path: path.name
 )
+@pytest.mark.slow
 def test_the_python_of_a_page_runs(page: Path, names: dict[str, Any]) -> None:
     names = dict(names)
     for block in blocks(page, "python"):

@@ -29,7 +29,7 @@ def double_precision() -> Iterator[None]:
 def quaternions(seed: int, count: int = 200) -> np.ndarray:
     """Random orientations (count, 4), the identity and half turns among them."""
     some = np.concatenate([np.eye(4), -np.eye(4), np.random.default_rng(seed).standard_normal((count - 8, 4))])
-    return some / np.linalg.norm(some, axis=-1, keepdims=True)
+    return np.asarray(some / np.linalg.norm(some, axis=-1, keepdims=True))
 
 
 def test_identity_and_inverse() -> None:

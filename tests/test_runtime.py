@@ -31,7 +31,7 @@ def nothing_is_set() -> Iterator[None]:
 
 def folder() -> str | None:
     """Return the folder of JAX's compilation cache."""
-    return jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    return jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined,no-any-return]
 
 
 def test_a_device_that_is_missing_is_named_in_one_line() -> None:

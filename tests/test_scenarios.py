@@ -27,8 +27,8 @@ from larp_model.physics import kinematics
 from larp_model.training import Windows
 from tasks import train
 from tasks.benchmarks import model
-from tasks.episodes.around_kick import overlaps, resting_height
-from tasks.motions.references import clearance
+from tasks.episodes.around_kick import overlaps
+from tasks.motions.references import clearance, resting_height
 from tasks.scenarios import SCENARIOS, around, scenario
 
 COUNT = 32
@@ -116,6 +116,7 @@ def test_other_weights_and_the_second_truth_are_rows_beside() -> None:
 
 
 @pytest.mark.parametrize("design", get_args(DesignName))
+@pytest.mark.slow
 def test_a_scene_becomes_weights_and_scores(
     design: DesignName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

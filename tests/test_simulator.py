@@ -49,7 +49,8 @@ def paper_simulator(paper: Model, paper_weights: Weights) -> Simulator:
 
 @pytest.fixture(params=["residual", "paper"])
 def simulator(request: pytest.FixtureRequest) -> Simulator:
-    return request.getfixturevalue(f"{request.param}_simulator")
+    simulator: Simulator = request.getfixturevalue(f"{request.param}_simulator")
+    return simulator
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +82,7 @@ def apart(first: np.ndarray, second: np.ndarray) -> float:
     return float(np.abs(first - second).max())
 
 
+@pytest.mark.slow
 def test_the_ball_is_kicked(residual_simulator: Simulator, kicks: tuple[np.ndarray, np.ndarray]) -> None:
     after = roll(residual_simulator, *kicks)
     changed = np.abs(after[:, -1, -1, 7:9] - kicks[0][:, -1, 7:9]).max(axis=-1)
@@ -122,6 +124,7 @@ def test_steps_make_the_rollout(residual_simulator: Simulator, kicks: tuple[np.n
     np.testing.assert_allclose(np.stack(after, axis=1), roll(residual_simulator, states, controls)[:, :3], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_steps_that_are_not_wanted_repeat_the_last(
     residual_simulator: Simulator, kicks: tuple[np.ndarray, np.ndarray]
 ) -> None:
@@ -186,7 +189,8 @@ def wide(after: Any) -> Any:
 
 def miss(simulator: Simulator, stop_gradient: bool, states: Array, controls: Array) -> Array:
     """`wide` of a rollout."""
-    return wide(rollout(simulator.model, simulator.weights, states, controls, stop_gradient=stop_gradient))
+    states = rollout(simulator.model, simulator.weights, states, controls, stop_gradient=stop_gradient)
+    return jnp.asarray(wide(states))
 
 
 def test_stopping_gradients_changes_nothing_but_gradients(
@@ -307,7 +311,7 @@ def test_arguments_that_are_no_arrays_of_numbers_are_refused_by_name(physics: Si
         ((state, control, object()), "torques is of type object"),
     ):
         with pytest.raises(InputError, match=name):
-            physics.step(*arguments)  # type: ignore[arg-type]
+            physics.step(*arguments)
 
 
 @pytest.mark.parametrize("scene", [Scene((chain(links=4),)), human_and_ball()], ids=["chain", "human and ball"])

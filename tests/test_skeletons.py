@@ -42,7 +42,7 @@ def retargeted(motion: Motion) -> np.ndarray:
     return skeleton.retarget(motion, human(), 0.01)[1]
 
 
-MIXAMO = {name: f"mixamorig:{name}" for name in bvh.NEEDED}
+MIXAMO = {name: f"mixamorig:{name}" for name in skeleton.NEEDED}
 OWN = {"Hips": "pelvis", "RightFoot": "r_ankle", "LeftArm": "Hips"}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -93,7 +94,7 @@ def test_time_and_memory_are_taken_in_a_process_of_its_own() -> None:
 
 
 def test_a_process_that_dies_becomes_a_row_that_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(speed.sys, "executable", "false")
+    monkeypatch.setattr(sys, "executable", "false")
     assert "code 1" in speed.QuestionRunner()(asked())["refused"]
 
 

@@ -19,8 +19,8 @@ from larp_model.learned.model import Model
 from larp_model.networks import Weights
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
-from mpc import CEM, Gradient
-from mpc.loop import DivergenceError, Phase, Window, execute
+from mpc import CEM, Gradient, Window
+from mpc.loop import DivergenceError, Phase, execute
 from tasks.benchmarks import gradients, promises, random_scenes, stability, stress
 from tasks.motions.references import Reference
 

@@ -334,7 +334,7 @@ def time_traced(question: Question, workload: Course) -> report.Row:
     def run(steps: int) -> float:
         nonlocal last
         begin = time.perf_counter()
-        last = jax.block_until_ready(ready.run(start, controls, jnp.int32(steps)))  # type: ignore[no-untyped-call]
+        last = jax.block_until_ready(ready.run(start, controls, jnp.int32(steps)))
         return time.perf_counter() - begin
 
     timing = timed(run, period if period < STEPS else 1, STEPS)
@@ -360,7 +360,7 @@ def time_gradient(question: Question, workload: Course) -> report.Row:
     def run(steps: int) -> float:
         nonlocal last
         begin = time.perf_counter()
-        last = jax.block_until_ready(ready.run(start, controls))  # type: ignore[no-untyped-call]
+        last = jax.block_until_ready(ready.run(start, controls))
         return time.perf_counter() - begin
 
     ready = compiled(cost, start, controls)

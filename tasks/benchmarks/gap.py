@@ -58,7 +58,7 @@ def candidates_of(
 
         return costs
 
-    in_model, in_truth = costs_in(session.models.whole), costs_in(truth.whole)
+    in_model, in_truth = costs_in(session.models.scene), costs_in(truth.scene)
     rows, parts = [], []
     for index in track(range(targets), description="plans", disable=not sys.stderr.isatty()):
         target, shift = random_kick(random)

@@ -13,14 +13,14 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from multiprocessing.context import SpawnProcess
 from multiprocessing.sharedctypes import Synchronized
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
-import psutil
 import viser
 from matplotlib.figure import Figure
 from rich.table import Table
@@ -39,6 +39,9 @@ from tasks.presets import PRESETS, PresetName
 from tasks.session import Session
 from tasks.targets import random_kick
 from viewer import LivePage
+
+if TYPE_CHECKING:
+    from psutil import Process
 
 # One in `SLOW` clients is slow: it waits `PATIENCE` [s] before each message.
 SLOW, PATIENCE = 5, 0.5
@@ -173,6 +176,8 @@ def main(
     """
     if min(kicks, alone, clients) < 1:
         raise InputError(f"kicks, alone and clients are {kicks}, {alone} and {clients}, but must be at least 1")
+    if find_spec("psutil") is None:
+        raise InputError("psutil is not installed: pip install 'larp-mpc[bench]'")
     report.ready(json, publish)
     prepare_jax()
     settings = PageSettings(kicks, alone, clients, preset, seed)
@@ -192,6 +197,8 @@ def measure(settings: PageSettings, json: Path) -> tuple[dict[str, report.Row], 
 
     json: where the figures go; an interrupted run resumes from the rows beside it.
     """
+    import psutil
+
     random = np.random.default_rng(settings.seed)
     targets = [random_kick(random)[0] for _ in range(settings.kicks)]
     kick, preset = Kick.standard(), settings.preset
@@ -225,7 +232,7 @@ def measure(settings: PageSettings, json: Path) -> tuple[dict[str, report.Row], 
     }
 
 
-def watchers(page: LivePage, clients: int, process: psutil.Process) -> tuple[SpawnProcess, Synchronized[int]]:
+def watchers(page: LivePage, clients: int, process: Process) -> tuple[SpawnProcess, Synchronized[int]]:
     """Start the process of the clients; return it, and its count of visits, once all of them are connected.
 
     process: this one, which serves the page.

@@ -366,9 +366,10 @@ def main(
     report.ready(json, publish, weights)
     prepare_jax()
     kick = Kick.standard()
-    continued_model = models_of(kick.scene, "larp", weights).whole
-    bench = Bench(kick, continued_model.dynamics)  # type: ignore[attr-defined]
-    jobs = jobs_of(bench, continued_model, states, seed) | scene_jobs(bench, scenes, seed)
+    models = models_of(kick.scene, "larp", weights)
+    assert models.simulator is not None
+    bench = Bench(kick, models.simulator)
+    jobs = jobs_of(bench, models.scene, states, seed) | scene_jobs(bench, scenes, seed)
     command = f"python -m tasks.benchmarks.stability --scenes {scenes} --seed {seed} --states {states}"
     rows = [row for result in report.collect(json, command, caught(jobs)) for row in result["rows"]]
     held = sum(row["held"] for row in rows)

@@ -178,7 +178,7 @@ def measure(kick: Kick, point: Point, weights: Path | None, targets: int, seed: 
         plans = [plan.info for plan in plans_of(execution)]
         spent = sum(info.seconds for info in plans)
         kicks.append(summarize(kick, execution, target) | {"planning_seconds": spent, "first_cost": plans[0].cost})
-    jax.clear_caches()  # type: ignore[no-untyped-call]  # the next point compiles other programs, and each occupies memory
+    jax.clear_caches()  # the next point compiles other programs, and each occupies memory
     errors = np.array([kick_figures["truth_error_m"] for kick_figures in kicks])
     return {
         "point": point.name,

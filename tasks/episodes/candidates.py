@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import replace
 
 import jax
 import numpy as np
 
 from larp_model.engines.episodes import Episodes
-from larp_model.engines.mujoco import SUBSTEPS
-from mpc import Continued, GaussNewton, MujocoDynamics
+from larp_model.engines.mujoco import SUBSTEPS, Truth
+from mpc import GaussNewton, MujocoDynamics
 from mpc.dynamics import BatchedTruth
 from tasks.kick import Kick
-from tasks.models import models_of
+from tasks.models import ROWS, with_flight
 from tasks.targets import random_kick
 
 # Optimiser that steps as the presets do, with enough rounds for most kicks to hit.
@@ -46,10 +45,9 @@ def candidate_episodes(kick: Kick, kicks: int, per_plan: int, seed: int, seconds
     seconds: time after which no other kick is begun.
     """
     random, start_time = np.random.default_rng(seed), time.perf_counter()
-    whole = models_of(kick.scene, "mujoco", substeps=SUBSTEPS).whole
-    assert isinstance(whole, Continued) and isinstance(whole.dynamics, MujocoDynamics)
-    recording = RecordingTruth(whole.dynamics.truth)
-    planner = kick.planner(replace(whole, dynamics=MujocoDynamics(recording)), (OPTIMIZER,))
+    recording = RecordingTruth(Truth(kick.scene, ROWS, SUBSTEPS))
+    ball = MujocoDynamics(Truth(kick.scene.only(kick.scene.bodies[-1].name), ROWS, SUBSTEPS))
+    planner = kick.planner(with_flight(kick.scene, MujocoDynamics(recording), ball), (OPTIMIZER,))
     chosen = []
     for index in range(kicks):
         target, shift = random_kick(random)
