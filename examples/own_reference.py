@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
 from tasks.kick import Kick
@@ -22,15 +21,14 @@ def leaning(path: Path) -> None:
     """Write the embedded kick as joint angles, with the torso bent by 0.1 rad more."""
     kick = Kick.standard()
     human, states = kick.scene.bodies[0], kick.reference.states
-    turns = [Rotation.from_quat(states[:, row, packed.ORIENTATION], scalar_first=True) for row in range(13)]
-    angles = [(turns[joint.parent].inv() * turns[row]).as_rotvec() for row, joint in enumerate(human.joints, 1)]
-    angles[human.link("torso") - 1][:, 1] += 0.1
+    angles = human.angles(states[:, : len(human.links), packed.ORIENTATION])
+    angles[:, human.link("torso") - 1, 1] += 0.1
     np.savez(
         path,
         rate=1.0 / kick.scene.dt,  # frames a second
         position=states[:, 0, packed.POSITION],  # of the pelvis (T, 3) [m], z up
         orientation=states[:, 0, packed.ORIENTATION],  # of the pelvis (T, 4), w x y z
-        angles=np.stack(angles, axis=1),  # rotation vectors (T, joints, 3) [rad], child in parent
+        angles=angles,  # rotation vectors (T, joints, 3) [rad], child in parent
         joints=[link.name for link in human.links[1:]],
     )
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from larp_model.errors import InputError
 
@@ -178,6 +179,15 @@ class Body:
         """Return lower and upper bounds of the joint targets, both (J, 3) [rad]."""
         bounds = np.array([(motor.lower, motor.upper) for _, _, motor in self.motors]).reshape(-1, 2, 3)
         return bounds[:, 0], bounds[:, 1]
+
+    def angles(self, orientations: np.ndarray) -> np.ndarray:
+        """Return the angles (T, J, 3) [rad] of motorised joints: rotation vectors of children in their parents' frames.
+
+        orientations: (T, n, 4) of the links, w, x, y, z.
+        """
+        rotations = [Rotation.from_quat(orientations[:, row], scalar_first=True) for row in range(len(self.links))]
+        angles = [(rotations[joint.parent].inv() * rotations[child]).as_rotvec() for child, joint, _ in self.motors]
+        return np.stack(angles, axis=1)
 
     @property
     def sizes(self) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from larp_model.anatomy import ANATOMIES, Detail
 from larp_model.bodies import ball, capsule, chain, detail_of, human, human_and_ball, standing_height, usual
@@ -253,3 +254,13 @@ def test_humans_that_differ_in_sizes_alone_have_one_usual_size() -> None:
 
 def test_a_ball_is_the_only_body_without_a_direction() -> None:
     assert ball().is_ball and not capsule().is_ball and not chain(links=1).is_ball and not human().is_ball
+
+
+def test_angles_are_those_by_which_children_are_turned_in_their_parents() -> None:
+    body, random = human(), np.random.default_rng(0)
+    angles = random.uniform(-1.0, 1.0, (5, len(body.motors), 3))
+    rotations = [Rotation.random(5, rng=random)]
+    for (_, joint, _), turn in zip(body.motors, np.moveaxis(angles, 1, 0), strict=True):
+        rotations.append(rotations[joint.parent] * Rotation.from_rotvec(turn))
+    orientations = np.stack([rotation.as_quat(scalar_first=True) for rotation in rotations], axis=1)
+    np.testing.assert_allclose(body.angles(orientations), angles, atol=1e-12)

@@ -83,15 +83,13 @@ def performed(name: str, scene: Scene, reference: Reference) -> ReferenceKick:
     """Return a reference's kick from its ground-truth states; the toe is the front end of the foot's axis."""
     human = scene.bodies[0]
     states = reference.states[:, scene.rows(human.name)]
-    turns = [
-        Rotation.from_quat(states[:, row, packed.ORIENTATION], scalar_first=True) for row in range(states.shape[1])
-    ]
-    angles = [(turns[joint.parent].inv() * turns[child]).as_rotvec() for child, joint, _ in human.motors]
+    angles = human.angles(states[..., packed.ORIENTATION])
     row = human.link("right_foot")
     foot = human.links[row]
-    arm = turns[row].apply(0.5 * foot.length * np.array(foot.axis))
+    rotation = Rotation.from_quat(states[:, row, packed.ORIENTATION], scalar_first=True)
+    arm = rotation.apply(0.5 * foot.length * np.array(foot.axis))
     toe = states[:, row, packed.VELOCITY] + np.cross(states[:, row, packed.ANGULAR_VELOCITY], arm)
-    return _kick(name, human, np.stack(angles, axis=1), np.linalg.norm(toe, axis=-1), reference.strike, scene.dt)
+    return _kick(name, human, angles, np.linalg.norm(toe, axis=-1), reference.strike, scene.dt)
 
 
 def recorded(path: Path, scene: Scene) -> ReferenceKick:

@@ -43,10 +43,7 @@ class KeyPoses:
         controls = np.zeros((steps, len(names), 3))
         for (joint, axis), angles in self.angles.items():
             controls[:, names.index(joint), axis] = PchipInterpolator(self.times, angles)(times)
-        lower, upper = (
-            np.array([getattr(motor, bound) for _, _, motor in body.motors]) for bound in ("lower", "upper")
-        )
-        targets: np.ndarray = np.clip(in_detail(body, controls), lower, upper)
+        targets: np.ndarray = np.clip(in_detail(body, controls), *body.limits)
         return targets
 
 

@@ -141,8 +141,7 @@ def retarget(motion: Motion, body: Body, dt: float) -> tuple[np.ndarray, np.ndar
     controls = np.stack(
         [(rotations[joint.parent].inv() * rotations[child]).as_rotvec() for child, joint, _ in body.motors], axis=1
     )
-    lower, upper = (np.array([getattr(motor, bound) for _, _, motor in body.motors]) for bound in ("lower", "upper"))
-    return rotations[0].as_quat(scalar_first=True), np.clip(controls, lower, upper)
+    return rotations[0].as_quat(scalar_first=True), np.clip(controls, *body.limits)
 
 
 def _link_rotation(motion: Motion, link: str) -> Rotation:

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
 from larp_model.bodies import human, standing_height
@@ -54,15 +53,11 @@ def cut(keypoints: Keypoints) -> Keypoints:
 def angles_of(states: np.ndarray, body: Body, dt: float) -> dict[str, Any]:
     """Return states (T, L, 13) as arguments of `motions.angles.motion`, scaled to the default human of 1.75 m."""
     height_ratio = standing_height(human()) / standing_height(body)
-    rotations = [
-        Rotation.from_quat(states[:, row, packed.ORIENTATION], scalar_first=True) for row in range(len(body.links))
-    ]
-    angles = [(rotations[joint.parent].inv() * rotations[child]).as_rotvec() for child, joint, _ in body.motors]
     return {
         "rate": 1.0 / dt,
         "position": height_ratio * states[:, 0, packed.POSITION],
         "orientation": states[:, 0, packed.ORIENTATION],
-        "angles": np.stack(angles, axis=1),
+        "angles": body.angles(states[..., packed.ORIENTATION]),
         "joints": [body.links[child].name for child, _, _ in body.motors],
     }
 
