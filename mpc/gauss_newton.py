@@ -60,7 +60,7 @@ class GaussNewton:
     directions: int = 24
     jacobian: Literal["forward", "differences"] = "differences"
     step: float = 0.02
-    """Of the differences, in spreads."""
+    """Length of the differences, in spreads."""
     damping: float = 1e-2
     """At first, as a share of the curvature's mean over the directions."""
     exponent: float = COLOUR

@@ -30,7 +30,7 @@ settings.load_profile("repeatable")
 
 @pytest.fixture(autouse=True, scope="session")
 def a_cache_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """What is compiled is remembered from one file of tests to the next, as commands remember it from run to run: here
+    """Keep compiled programs from one file of tests to the next, as commands keep them from run to run: here
     not in the user's cache, nor in that of another process.
     """
     with pytest.MonkeyPatch.context() as patch:

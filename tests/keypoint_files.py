@@ -201,7 +201,7 @@ def loaded(write: Write, film: Film, **arguments: Any) -> formats.LoadedKeypoint
 
 
 def expected(people: list[Person | None], order: dict[str, int] = COCO) -> np.ndarray:
-    """What is to be read (T, P, 3) of one person, who is missing in some frames, in a format with these points."""
+    """Return the points (T, P, 3) that a format with these points yields of a person who is missing in some frames."""
     all_points = np.full((len(people), len(POINTS), 3), (np.nan, np.nan, 0.0))
     for frame, person in zip(all_points, people, strict=True):
         for row, name in enumerate(POINTS):

@@ -82,7 +82,7 @@ def eventually(holds: Callable[[], bool]) -> None:
 
 
 def receives(listening: Connection, text: str) -> bool:
-    """Whether the client gets a message with this text soon."""
+    """Return whether the client gets a message with this text soon."""
     while True:
         window = listening.recv(timeout=SOON)
         assert isinstance(window, bytes)

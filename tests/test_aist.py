@@ -40,7 +40,7 @@ SPREAD, DISTORTION = (1480.0, 1500.0), (-0.1, 0.02, 1e-3, -5e-4, 0.003)
 
 
 class Filmed(NamedTuple):
-    """What was annotated: its folder, the camera, and where the points are (T, P, 3) [m]."""
+    """Annotations of a film: their folder, the camera, and the positions of the points (T, P, 3) [m]."""
 
     folder: Path
     lens: Camera

@@ -1,4 +1,4 @@
-"""What all benchmarks promise: nothing is lost when they are cut off, and nothing tracked changes unasked."""
+"""Promises of all benchmarks: nothing is lost when they are cut off, and nothing tracked changes unasked."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tasks.presets import PRESETS, Preset
 
 
 class CutOffError(Exception):
-    """What ends a run before its time."""
+    """Error that ends a run before its time."""
 
 
 def jobs(done: list[int], until: int = 5) -> dict[str, partial[report.Row]]:

@@ -63,7 +63,7 @@ def standing(scene: Scene) -> np.ndarray:
 
 
 def open_worlds() -> int:
-    """How many simulations the engine holds."""
+    """Return the number of simulations that the engine holds."""
     import pybullet
 
     return sum(pybullet.isConnected(client) for client in range(1024))

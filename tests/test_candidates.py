@@ -1,4 +1,4 @@
-"""What the planner tries in the truth is what happens there, starts where the kick does and leads to the targets."""
+"""Candidates of the planner are what happens in the ground truth, start as the kick does and reach the targets."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What a client of the page can do to it and to other clients, and what not."""
+"""Limits of a client of the page: its messages harm neither the page nor other clients."""
 
 import math
 from collections.abc import Callable, Iterator

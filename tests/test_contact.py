@@ -78,12 +78,12 @@ def ends(first: Segment, second: Segment, found: ClosestPoints) -> tuple[Array, 
 
 
 def apart(first: Segment, second: Segment) -> np.ndarray:
-    """Which pairs do not have crossing axes, so that their normal is defined."""
+    """Return a mask of pairs whose axes do not cross, so that their normal is defined."""
     return np.asarray(closest(first, second).distance + first.radius + second.radius) > 1e-6
 
 
 def skew(first: Segment, second: Segment) -> np.ndarray:
-    """Which pairs are neither parallel nor balls, so that their closest points are unique."""
+    """Return a mask of pairs that are neither parallel nor balls, so that their closest points are unique."""
     return np.asarray(np.linalg.norm(np.cross(first.half, second.half), axis=-1) > 1e-3)
 
 

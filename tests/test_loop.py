@@ -241,7 +241,7 @@ def test_a_length_that_is_never_reached_is_refused_by_name() -> None:
 
 
 def _missed(planner: Planner, plan: Plan, truth: Mover) -> float:
-    """How far from the target the plan truly ends [m]."""
+    """Return the distance [m] from the target at which the plan ends in the ground truth."""
     controls = planner.controls(plan, np.zeros((HORIZON, 1, 3)))
     end = truth.rollout(jnp.asarray(START)[None], controls[None])[0, -1, 0, :3]
     return float(np.linalg.norm(end - TARGET))

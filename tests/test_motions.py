@@ -72,7 +72,7 @@ def test_in_detail_a_body_turns_its_head_and_limbs_as_the_lean_one_does(targets:
 
 
 def world_turns(body: Body, targets: np.ndarray) -> dict[str, Rotation]:
-    """How the links of a body are turned whose joints are as targets (J, 3) [rad] want them."""
+    """Return the rotations of a body's links, by name, with its joints at targets (J, 3) [rad]."""
     found = {body.links[0].name: Rotation.identity()}
     for (child, joint, _), turn in zip(body.motors, targets, strict=True):
         parent = body.links[joint.parent].name

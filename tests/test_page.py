@@ -59,7 +59,7 @@ def until(what: Callable[[], object], seconds: float = 60.0) -> None:
 
 
 def planned_for(served: Served) -> Settings:
-    """What the last plan that waits to be carried out is for."""
+    """Return the settings of the last plan that waits to be executed."""
     assert served.live.planned_for is not None
     return served.live.planned_for
 
@@ -150,7 +150,7 @@ def pixels(seen: Page, path: Path) -> np.ndarray:
 
 
 def placed(seen: Page, served: Served, point: np.ndarray) -> tuple[float, float]:
-    """Where a point (3,) [m] is on the page, in pixels."""
+    """Return the position of a point (3,) [m] on the page, in pixels."""
     stage, (view, aspect) = served.page._stage, [*served.page._clients.views.values()][-1]
     assert stage is not None
     camera = stage.camera(next(each for each in VIEWS if each == view), aspect)
@@ -239,7 +239,7 @@ def test_a_slider_changes_the_weight_of_its_cost_and_the_plan(seen: Page, served
 
 
 def beside(seen: Page, label: str) -> Locator:
-    """What takes input beside a label."""
+    """Return the input beside a label."""
     return seen.locator("div", has=seen.get_by_text(label, exact=True)).last.locator("xpath=..").locator("input")
 
 
@@ -374,7 +374,7 @@ def test_a_push_moves_the_body_that_it_is_for(
 
 
 def unfolded(seen: Page, label: str) -> Locator:
-    """What is under "View", which is folded up at first, by its label."""
+    """Return a control under "View", which is folded up at first, by its label."""
     found = seen.get_by_text(label, exact=True)
     if not found.is_visible():
         seen.get_by_text("View", exact=True).click()

@@ -19,7 +19,7 @@ def test_the_command_line_offers_every_preset() -> None:
 
 
 def candidates(stages: tuple[Optimizer, ...]) -> int:
-    """How many all rounds of CEM and Gauss-Newton try, the steps' dampings left out."""
+    """Return the number of candidates of all rounds of CEM and Gauss-Newton, without the steps' dampings."""
     rounds = [sum(each.sizes) for each in stages if isinstance(each, CEM)]
     return sum(rounds) + sum(each.rounds * each.directions for each in stages if isinstance(each, GaussNewton))
 

@@ -1,4 +1,4 @@
-"""What the benchmark of speed promises: fair questions, rows that say why, and errors that fall with the step."""
+"""Promises of the speed benchmark: fair questions, rows that say why, and errors that fall with the step."""
 
 from __future__ import annotations
 

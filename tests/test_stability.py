@@ -1,4 +1,4 @@
-"""What is pushed too far says so: precision, lost worlds, great gradients, odd scenes; and the benchmark of it."""
+"""Limits are reported: precision, diverging worlds, great gradients, odd scenes; and the benchmark of them."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ rows = st.lists(
 
 
 def better(one: report.Row, other: report.Row) -> bool:
-    """Whether one is at least as good in both figures, and better in one of them."""
+    """Return whether one is at least as good in both figures, and better in one of them."""
     pairs = [(one[name], other[name]) for name in ("planning_seconds", "mean_truth_error_m")]
     return all(a <= b for a, b in pairs) and any(a < b for a, b in pairs)
 

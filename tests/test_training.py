@@ -43,7 +43,7 @@ def swings() -> Episodes:
 
 
 def same(first: Weights, second: Weights) -> bool:
-    """Whether two sets of weights are equal bit for bit."""
+    """Return whether two sets of weights are equal bit for bit."""
     return all(jax.tree.leaves(jax.tree.map(np.array_equal, first, second)))
 
 

@@ -49,7 +49,7 @@ def page() -> Iterator[LivePage]:
 
 
 def volume(*meshes: Mesh) -> float:
-    """What closed meshes enclose together, by the divergence theorem."""
+    """Return the volume that closed meshes enclose together, by the divergence theorem."""
     return sum(float(np.linalg.det(vertices[faces].astype(float)).sum()) / 6.0 for vertices, faces in meshes)
 
 

@@ -30,7 +30,7 @@ def stored(tmp_path: Path, paper: Model, paper_weights: Weights) -> Path:
 
 
 def equal(first: Weights, second: Weights) -> bool:
-    """Whether two sets of weights are equal bit for bit."""
+    """Return whether two sets of weights are equal bit for bit."""
     return all(jax.tree.leaves(jax.tree.map(np.array_equal, first, second)))
 
 
@@ -111,7 +111,7 @@ def test_saving_twice_writes_the_same_bytes(stored: Path, paper: Model, paper_we
 
 
 def refusal(stored: Path, scene: Scene) -> str:
-    """What `load` says when it refuses; one line that names a file."""
+    """Return the message with which `load` refuses; one line that names a file."""
     with pytest.raises(InputError) as caught:
         load(stored, scene)
     assert "\n" not in str(caught.value) and str(stored.with_suffix("")) in str(caught.value)
