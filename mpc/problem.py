@@ -201,7 +201,7 @@ class PlannerProblem:
 
     def plan_cost(self, knots: np.ndarray) -> tuple[float, dict[str, float]]:
         """Return the cost of knots (K, J, 3) and each term's share of it."""
-        cost, terms = self.run("judge", self.equations.plan_cost, self.inputs, knots, self.states_of(knots))
+        cost, terms = self.run("plan cost", self.equations.plan_cost, self.inputs, knots, self.states_of(knots))
         return float(cost), {name: float(value) for name, value in terms.items()}
 
     def _evaluate(self, dynamics: Dynamics, knots: np.ndarray, size: int) -> Evaluations:

@@ -40,11 +40,12 @@ def measured(contact: int | None, count: int) -> tuple[int, int]:
     return (0, count) if contact is None else (max(contact - 1, 0), min(contact + AFTER_CONTACT + 1, count))
 
 
-def summarize(task: Task, execution: Execution, goal: Any) -> dict[str, Any]:
+def summary_of(task: Task, execution: Execution, goal: Any) -> dict[str, Any]:
     """Return the figures of an execution, entries of `summary.json`; docs/runs.md explains each."""
     states, plans = np.stack(execution.states), plans_of(execution)
     free = task.untouched(states[0], len(states) - 1)
-    begin, end = measured(strike_step(states, free), len(states))
+    contact = strike_step(states, free)
+    begin, end = measured(contact, len(states))
     last = plans[-1]
     truth_error = task.missed(states[begin:end], begin, goal)
     model_error = task.missed(last.info.states, last.step + 1, goal)
@@ -60,7 +61,7 @@ def summarize(task: Task, execution: Execution, goal: Any) -> dict[str, Any]:
         "model_error_m": model_error,
         "metrics": task.metrics(states[begin:end], goal),
         "ball_speed_m_s": float(np.linalg.norm(states[begin:end, task.ball, packed.VELOCITY], axis=-1).max()),
-        "touched": strike_step(states, free) is not None,
+        "touched": contact is not None,
         "reachable": model_error <= REACHABLE,
         "gap": gap(task.scene, states, np.concatenate([last.state[None], last.info.states]), last.step, free),
         "reference_deviation_m": float(deviation.mean()),
@@ -117,7 +118,7 @@ class Run:
     @classmethod
     def of(cls, task: Task, execution: Execution, goal: Any, **labels: Any) -> Run:
         """Return the run of an execution for a goal; labels: further entries of the summary, such as the preset."""
-        return cls(task, execution, goal, summarize(task, execution, goal) | labels)
+        return cls(task, execution, goal, summary_of(task, execution, goal) | labels)
 
     @property
     def states(self) -> np.ndarray:

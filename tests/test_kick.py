@@ -22,7 +22,7 @@ from tasks import kick
 from tasks.command import Teller, run
 from tasks.motions import references
 from tasks.presets import PRESETS, Preset
-from tasks.run import replayed, summarize
+from tasks.run import replayed, summary_of
 from tasks.session import Session
 from tasks.targets import random_kick
 
@@ -103,7 +103,7 @@ def test_fast_hits_its_targets_and_stays_near_the_reference(task: kick.Kick) -> 
     for seed in range(3):
         target, shift = random_kick(random)
         execution = session.execute(session.planners("fast"), target, seed, task.start(shift), recovers=False)
-        reports.append(summarize(task, execution, target))
+        reports.append(summary_of(task, execution, target))
     assert np.mean([report["truth_error_m"] for report in reports]) <= 0.08
     assert max(report["reference_deviation_m"] for report in reports) <= 0.05
     assert sum(report["compile_seconds"] for report in reports) > 0.0
@@ -113,7 +113,7 @@ def test_fast_hits_its_targets_and_stays_near_the_reference(task: kick.Kick) -> 
 def test_with_the_truth_as_model_what_is_predicted_happens(task: kick.Kick, small: None) -> None:
     session, target = Session(task, "mujoco", substeps=task.substeps), np.array([3.0, 0.2, 0.4])
     execution = session.execute(session.planners("fast")._replace(interval=100), target, seed=0, recovers=False)
-    report = summarize(task, execution, target)
+    report = summary_of(task, execution, target)
     assert report["touched"]
     assert report["truth_error_m"] == pytest.approx(report["model_error_m"], abs=0.01)
 
@@ -122,7 +122,7 @@ def test_the_limit_is_the_miss_of_the_same_controls_at_the_finer_step(small: Non
     coarse = kick.Kick.standard(substeps=4)
     session, target = Session(coarse, "mujoco", substeps=4), np.array([3.0, 0.2, 0.4])
     execution = session.execute(session.planners("fast"), target, seed=0, recovers=False)
-    report = summarize(coarse, execution, target)
+    report = summary_of(coarse, execution, target)
     assert replayed(coarse, execution, target, substeps=4) == pytest.approx(report["truth_error_m"], abs=1e-6)
     assert report["limit_error_m"] == replayed(coarse, execution, target)
     assert abs(report["limit_error_m"] - report["truth_error_m"]) > 0.01

@@ -161,7 +161,7 @@ def test_a_replay_that_diverged_is_infinitely_far_off_in_the_median_only() -> No
     def row(error: float) -> list[report.Row]:
         return [{"engine": "larp", "substeps": 1, "error_m": error, "launch_error": error}]
 
-    (found,) = replays.summarise([row(0.1), row(float("nan")), row(float("inf"))])
+    (found,) = replays.figures_of([row(0.1), row(float("nan")), row(float("inf"))])
     assert found["mean_m"] == pytest.approx(0.1) and found["diverged"] == 2 and found["median_m"] is None
 
 

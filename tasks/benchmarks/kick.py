@@ -21,7 +21,7 @@ from tasks.episodes.people import random_people
 from tasks.kick import USUAL, Kick
 from tasks.models import DynamicsName
 from tasks.presets import PresetName, preset_of
-from tasks.run import replayed, summarize
+from tasks.run import replayed, summary_of
 from tasks.sensing import noisy
 from tasks.session import Planners, Session
 from tasks.targets import random_kick, random_roll
@@ -106,7 +106,7 @@ class KickSettings:
         )
 
 
-def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
+def figures_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the figures of a set of kicks."""
     truth = np.array([row["truth_error_m"] for row in rows])
     limit = np.array([row["limit_error_m"] for row in rows])
@@ -206,7 +206,7 @@ def main(
     report.ready(json, publish, weights)
     prepare_jax()
     rows = report.collect(json, settings.command, jobs_of(settings))
-    figures = summarise(rows)
+    figures = figures_of(rows)
     content = {"command": settings.command, "hardware": report.hardware(), **figures, "rows": rows}
     report.write_json(json, content)
     report.write_picture(json.with_suffix(".png"), picture(rows, settings.title))
@@ -262,7 +262,7 @@ def kick_row(
     session, kick, seed = planned.session, planned.session.task, settings.seed + index
     sense = noisy(kick.scene, np.random.default_rng((settings.seed, index))) if settings.noise else lambda state: state
     execution = session.execute(planned.planners, target, seed, kick.start(shift, roll), sense=sense)
-    return summarize(kick, execution, target) | {
+    return summary_of(kick, execution, target) | {
         "halved_error_m": replayed(kick, execution, target, 2 * settings.substeps),
         "preset": settings.preset,
         "dynamics": settings.dynamics,
@@ -274,7 +274,7 @@ def kick_row(
 
 
 def table_of(figures: dict[str, Any], settings: KickSettings) -> Table:
-    """Return a table with one line per figure of `summarise`."""
+    """Return a table with one line per figure of `figures_of`."""
 
     def three(figure: str) -> str:
         return ", ".join(f"{figures[f'{which}_{figure}']:.3f} m" for which in ("mean", "median", "p95"))

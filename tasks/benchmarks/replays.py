@@ -113,7 +113,7 @@ def replay_errors(scene: Scene, kicked: Kicked, players: dict[Engine, Player]) -
     return rows
 
 
-def summarise(kicks: Iterable[list[report.Row]]) -> list[report.Row]:
+def figures_of(kicks: Iterable[list[report.Row]]) -> list[report.Row]:
     """Return each engine's errors over all kicks; None for what is not finite.
 
     A kick in which an engine diverged is left out of its mean, and counts as infinitely far off in its medians.

@@ -404,7 +404,7 @@ def measure(settings: SpeedSettings, json: Path) -> SpeedMeasurement:
     collected = report.collect(json, settings.command, jobs | kick_jobs)
     rows = dict(zip([*jobs, *kick_jobs], collected, strict=True))
     kicks = [rows[name] for name in kick_jobs]
-    summaries = replays.summarise(row["replays"] for row in kicks)
+    summaries = replays.figures_of(row["replays"] for row in kicks)
     launch = {(row["engine"], row["substeps"]): row["launch_error"] for row in summaries}
     for row in summaries:
         row["us_per_scene_step"] = rows[price(row["engine"], row["substeps"], seed).name].get("us_per_scene_step")

@@ -21,7 +21,7 @@ from tasks.command import prepare_jax, run
 from tasks.kick import Kick
 from tasks.models import FLIGHT, DynamicsName
 from tasks.presets import PRESETS, Preset
-from tasks.run import plans_of, summarize
+from tasks.run import plans_of, summary_of
 from tasks.session import Session
 from tasks.targets import random_kick
 from tasks.task import BEYOND
@@ -177,7 +177,7 @@ def measure(kick: Kick, point: Point, weights: Path | None, targets: int, seed: 
         execution = session.execute(planners, target, seed + index, kick.start(shift), steps, recovers=False)
         plans = [plan.info for plan in plans_of(execution)]
         spent = sum(info.seconds for info in plans)
-        kicks.append(summarize(kick, execution, target) | {"planning_seconds": spent, "first_cost": plans[0].cost})
+        kicks.append(summary_of(kick, execution, target) | {"planning_seconds": spent, "first_cost": plans[0].cost})
     jax.clear_caches()  # the next point compiles other programs, and each occupies memory
     errors = np.array([kick_figures["truth_error_m"] for kick_figures in kicks])
     return {
