@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -50,8 +51,8 @@ class Served:
     thread: threading.Thread
 
 
-def until(what: Callable[[], object], seconds: float = 60.0) -> None:
-    """Wait until something is so."""
+def until(what: Callable[[], object], seconds: float = 120.0) -> None:
+    """Wait until something is so; a browser that shares two cores with other tests may draw seconds later."""
     end = time.monotonic() + seconds
     while not what():
         assert time.monotonic() < end, "it took too long"
@@ -144,9 +145,13 @@ def played(seen: Page, served: Served) -> Page:
     return seen
 
 
-def pixels(seen: Page, path: Path) -> np.ndarray:
-    seen.screenshot(path=path)
-    return np.asarray(imread(path))[..., :3]
+def pixels(seen: Page) -> np.ndarray:
+    return np.asarray(imread(BytesIO(seen.screenshot())))[..., :3]
+
+
+def changed_share(before: np.ndarray, after: np.ndarray) -> float:
+    """Return the share of a picture's pixels whose colour differs."""
+    return float((np.abs(after - before).max(axis=-1) > 0.1).mean())
 
 
 def placed(seen: Page, served: Served, point: np.ndarray) -> tuple[float, float]:
@@ -173,6 +178,15 @@ def drag(seen: Page, place: tuple[float, float], right: int = 0, up: int = 0) ->
     seen.mouse.up()
 
 
+def reset(seen: Page, served: Served) -> None:
+    """Go back to the plan, and wait until the page has drawn it: two pictures in succession are the same."""
+    if served.page.mode != "planned":
+        seen.get_by_text("Reset", exact=True).click()
+        until(lambda: served.page.mode == "planned")
+    time.sleep(2.0)
+    until(lambda: changed_share(pixels(seen), pixels(seen)) < 0.001)
+
+
 def kicks(served: Served, ask: Callable[[], object]) -> None:
     """Ask for a kick, and wait until it is played."""
     before = served.live.run
@@ -182,16 +196,18 @@ def kicks(served: Served, ask: Callable[[], object]) -> None:
 
 @pytest.mark.parametrize("size", [(1400, 900), (480, 800)], ids=["wide", "narrow"])
 def test_the_page_is_not_blank_and_has_human_and_target_in_its_picture(
-    size: tuple[int, int], browser: Browser, served: Served, tmp_path: Path
+    size: tuple[int, int], browser: Browser, served: Served
 ) -> None:
     page = opened(browser, served, size)
-    time.sleep(3.0)
-    picture = pixels(page, tmp_path / "page.png")
+
+    def is_drawn() -> bool:
+        picture = pixels(page)
+        red, green, blue = np.moveaxis(picture, -1, 0)
+        green, blue = (green > red + 0.12) & (green > blue + 0.02), blue > red + 0.15
+        return bool((np.ptp(picture, axis=-1) > 0.3).mean() > 0.002 and green.any() and blue.any())
+
+    until(is_drawn)
     page.close()
-    green = (picture[..., 1] > picture[..., 0] + 0.12) & (picture[..., 1] > picture[..., 2] + 0.02)
-    blue = picture[..., 2] > picture[..., 0] + 0.15
-    assert (np.ptp(picture, axis=-1) > 0.3).mean() > 0.002, "nothing coloured is on the page"
-    assert green.any() and blue.any()
 
 
 def test_replay_runs_from_its_file_alone(played: Page, browser: Browser, served: Served, tmp_path: Path) -> None:
@@ -201,25 +217,22 @@ def test_replay_runs_from_its_file_alone(played: Page, browser: Browser, served:
     errors: list[str] = []
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.goto((tmp_path / "kick.html").as_uri())
-    until(lambda: (np.ptp(pixels(page, tmp_path / "page.png"), axis=-1) > 0.3).mean() > 0.001)  # coloured, not blank
+    until(lambda: (np.ptp(pixels(page), axis=-1) > 0.3).mean() > 0.001)  # coloured, not blank
     page.close()
     assert not errors
 
 
-def test_a_key_kicks_and_the_ball_moves(seen: Page, served: Served, tmp_path: Path) -> None:
-    before = pixels(seen, tmp_path / "before.png")
+def test_a_key_kicks_and_the_ball_moves(seen: Page, served: Served) -> None:
+    before = pixels(seen)
     kicks(served, lambda: seen.keyboard.press("k"))
     assert served.live.run is not None
     assert served.live.run.summary["touched"]
     assert np.linalg.norm(np.ptp(served.live.run.recording.path, axis=0)) > 0.5
-    time.sleep(1.0)
-    assert (np.abs(pixels(seen, tmp_path / "after.png") - before).max(axis=-1) > 0.1).mean() > 0.01
+    until(lambda: changed_share(before, pixels(seen)) > 0.01)
 
 
 def test_what_is_dragged_changes_the_plan(seen: Page, served: Served) -> None:
-    seen.get_by_text("Reset", exact=True).click()
-    until(lambda: served.page.mode == "planned")
-    time.sleep(2.0)
+    reset(seen, served)
     before, plans = served.page.settings.target, served.live.plans
     # The arrow that points up is one of few things whose place in the picture is known: above the target.
     drag(seen, placed(seen, served, np.add(before, (0.0, 0.0, 0.25))), up=40)
@@ -256,10 +269,7 @@ def test_the_ball_is_dragged_to_where_it_lies_and_by_how_it_rolls(
 ) -> None:
     handles = served.page._handles
     assert handles is not None
-    if served.page.mode != "planned":
-        seen.get_by_text("Reset", exact=True).click()
-        until(lambda: served.page.mode == "planned")
-    time.sleep(2.0)
+    reset(seen, served)
     before = getattr(served.page.settings, setting)
     drag(seen, placed(seen, served, np.add(handles.ball_position, arrow)), right=20)
     until(lambda: getattr(served.page.settings, setting) != before)
