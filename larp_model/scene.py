@@ -170,6 +170,20 @@ class Body:
         return len(self.links) == 1 and self.links[0].length == 0.0
 
     @property
+    def parents(self) -> np.ndarray:
+        """Return the rows (n - 1,) of the parents of all links but the root; joint j is that of link j + 1."""
+        return np.array([joint.parent for joint in self.joints], int)
+
+    @property
+    def ancestors(self) -> np.ndarray:
+        """Return (n, n - 1) 1 where a joint is between a link and the root, else 0."""
+        matrix = np.zeros((len(self.links), len(self.joints)))
+        for joint, parent in enumerate(self.parents):
+            matrix[joint + 1] = matrix[parent]
+            matrix[joint + 1, joint] = 1.0
+        return matrix
+
+    @property
     def motors(self) -> tuple[tuple[int, Joint, Motor], ...]:
         """Return (child link, joint, motor) of each motorised joint."""
         return tuple((i, j, j.motor) for i, j in enumerate(self.joints, start=1) if j.motor is not None)

@@ -29,6 +29,7 @@ ORDER = [
     "larp_model.detection",
     "larp_model.physics.contact",
     "larp_model.physics.articulated",
+    "larp_model.physics.admittance",
     "larp_model.physics.ground",
     "larp_model.physics.motion",
     "larp_model.physics.ball",

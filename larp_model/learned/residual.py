@@ -57,13 +57,15 @@ class ResidualModel:
     ) -> Array:
         """See `Model`; contacts have no network, so that `stop_gradient` has no effect."""
 
-        def correct(body: Body, links: Kinematics, motion: BodyMotion, dt: float) -> BodyMotion:
+        def correct(body: Body, links: Kinematics, motion: BodyMotion, dt: Array | float) -> BodyMotion:
             physics_alone = self.size is None or body.is_ball
             return motion if physics_alone else self._corrected(body, weights, links, motion, dt)
 
         return physics_step(self.scene, state, control, torque, morphology, self.constants, self.contacts, correct)
 
-    def _corrected(self, body: Body, weights: Weights, links: Kinematics, motion: BodyMotion, dt: float) -> BodyMotion:
+    def _corrected(
+        self, body: Body, weights: Weights, links: Kinematics, motion: BodyMotion, dt: Array | float
+    ) -> BodyMotion:
         """Return the motion (n, 3, B) within `dt` [s] as the network corrects it."""
         name = network_name("dynamics", body)
         turn, inputs = network_inputs(body, links, motion, dt)
@@ -117,7 +119,7 @@ class ResidualModel:
         return bounded(evaluate(self.networks()[name], weights, name, inputs), self.bound)
 
 
-def network_inputs(body: Body, links: Kinematics, motion: BodyMotion, dt: float) -> tuple[Array, Array]:
+def network_inputs(body: Body, links: Kinematics, motion: BodyMotion, dt: Array | float) -> tuple[Array, Array]:
     """Return the frame of a body's network, cosine and sine (B, 2), and its inputs (B, F)."""
     turn = rotation.course(links.orientation[0].T, body.links[0].axis)
     axes = jnp.array([link.axis for link in body.links], links.state.dtype)[..., None]
@@ -142,7 +144,7 @@ def true_motion(links: Kinematics, after: Array) -> BodyMotion:
     return BodyMotion(*(jnp.moveaxis(array, 0, -1) for array in motion))
 
 
-def changes(links: Kinematics, motion: BodyMotion, dt: float) -> Array:
+def changes(links: Kinematics, motion: BodyMotion, dt: Array | float) -> Array:
     """Return a motion as changes (4, n, 3, B), to which networks add.
 
     Of velocity [m/s] and angular velocity [rad/s], and corrections [m, rad] of the trapezoidal step

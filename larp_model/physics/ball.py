@@ -5,7 +5,7 @@ Arrays have the batch last, as in `linalg`: vectors (1, 3, B).
 
 from __future__ import annotations
 
-import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +19,13 @@ from larp_model.scene import Body
 SUBSTEPS = 20
 
 
-def ball_motion(body: Body, links: Kinematics, torques: Array, gravity: float, dt: float) -> BodyMotion:
-    """Return the motion of a ball within `dt` [s] if nothing but the ground touches it; torques (1, 3, B) [N m]."""
+def ball_motion(
+    body: Body, links: Kinematics, torques: Array, gravity: float, dt: Array | float, on_ground: Array | bool = True
+) -> BodyMotion:
+    """Return the motion of a ball within `dt` [s] if nothing but the ground touches it; torques (1, 3, B) [N m].
+
+    on_ground: whether the ground does; if not, the ball moves as in the air.
+    """
     surface, h = body.surface, dt / SUBSTEPS
     length, radius, mass = links.sizes[0]
     inverse_mass, inverse_moment = 1.0 / mass, 1.0 / moments(length, radius, mass)[0]
@@ -55,7 +60,8 @@ def ball_motion(body: Body, links: Kinematics, torques: Array, gravity: float, d
 
     velocity, angular_velocity = links.velocity, links.angular_velocity
 
-    def on_the_ground() -> BodyMotion:
+    @partial(jax.checkpoint, prevent_cse=False)
+    def in_substeps(velocity: Array, angular_velocity: Array) -> BodyMotion:
         zero = jnp.zeros_like(velocity[0])
         after, _ = jax.lax.scan(substep, (*zero, *velocity[0], *angular_velocity[0]), length=SUBSTEPS)
         translation, end_velocity, end_angular_velocity = (
@@ -65,25 +71,16 @@ def ball_motion(body: Body, links: Kinematics, torques: Array, gravity: float, d
             end_velocity, end_angular_velocity, translation, 0.5 * dt * (angular_velocity + end_angular_velocity)
         )
 
+    def in_the_air(velocity: Array, angular_velocity: Array) -> BodyMotion:
+        gravity_vector = jnp.array([0.0, 0.0, -gravity], velocity.dtype)[:, None]
+        end_angular_velocity = angular_velocity + dt * inverse_moment * torques
+        # As long as a fall in substeps takes, where the step is one of them.
+        square = dt * (dt + jnp.where(on_ground, h, 0.0))
+        translation = dt * velocity + 0.5 * square * gravity_vector
+        rotation_vector = 0.5 * dt * (angular_velocity + end_angular_velocity)
+        return BodyMotion(velocity + dt * gravity_vector, end_angular_velocity, translation, rotation_vector)
+
     lowest = height + jnp.minimum(dt * velocity[0, 2] - dt**2 * gravity, 0.0)
-    motion: BodyMotion = jax.lax.cond(
-        jnp.any(lowest < 0.0), on_the_ground, lambda: flight(body, links, torques, gravity, dt, SUBSTEPS)
-    )
+    touches = on_ground & jnp.any(lowest < 0.0)
+    motion: BodyMotion = jax.lax.cond(touches, in_substeps, in_the_air, velocity, angular_velocity)
     return motion
-
-
-def flight(
-    body: Body, links: Kinematics, torques: Array, gravity: float, dt: float, substeps: float = math.inf
-) -> BodyMotion:
-    """Return `ball_motion` of a ball that nothing touches, of so many substeps."""
-    velocity, angular_velocity = links.velocity, links.angular_velocity
-    gravity_vector = jnp.array([0.0, 0.0, -gravity], velocity.dtype)[:, None]
-    inverse_moment = 1.0 / moments(*(links.sizes[:, column : column + 1] for column in range(3)))[0]
-    end_angular_velocity = angular_velocity + dt * inverse_moment * torques
-    translation = dt * velocity + 0.5 * dt * (dt + dt / substeps) * gravity_vector
-    return BodyMotion(
-        velocity + dt * gravity_vector,
-        end_angular_velocity,
-        translation,
-        0.5 * dt * (angular_velocity + end_angular_velocity),
-    )

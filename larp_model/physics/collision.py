@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model.linalg import cross, dot, norm
+from larp_model.linalg import contract, cross, dot, norm
 from larp_model.physics.kinematics import Kinematics
 from larp_model.scene import Scene, Surface
 
@@ -161,7 +161,7 @@ class Candidates:
         """Return the names of the balls."""
         return tuple(body.name for body in self.scene.bodies if body.is_ball)
 
-    def gaps(self, links: Kinematics, rates: Rates, dt: float, settings: ContactSettings) -> Array:
+    def gaps(self, links: Kinematics, rates: Rates, dt: Array | float, settings: ContactSettings) -> Array:
         """Return the smallest gap (P, B) [m] of every pair of links within `dt` [s], at their mean accelerations."""
         first, second = self.rows
 
@@ -216,8 +216,6 @@ def turned_vectors(vector: Array, by: Array) -> Array:
 
 def select(one_hot: Array, values: Array) -> Array:
     """Return the values (S, ..., B) that one-hot rows (S, L, B) select from (L, ..., B or 1)."""
-    rows = one_hot.reshape(*one_hot.shape[:2], *[1] * (values.ndim - 2), one_hot.shape[-1])
-    total = rows[:, 0] * values[0]
-    for row in range(1, len(values)):
-        total += rows[:, row] * values[row]
-    return total
+    flat = values.reshape(len(values), -1, values.shape[-1])
+    selected = contract("sl,lk->sk", one_hot, flat)
+    return selected.reshape(len(one_hot), *values.shape[1:-1], selected.shape[-1])

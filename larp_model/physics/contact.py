@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model.linalg import barrier, dot, inverse, mm, mv
+from larp_model.linalg import barrier, dot, inverse, mm, mv, solution
 
 # The share of the constraint that is a spring; the rest follows the free motion (MuJoCo's impedance).
 IMPEDANCE = 0.99
@@ -113,8 +113,8 @@ def impulses_of(problem: ContactProblem, guess: Array, iterations: int) -> Array
         return (carry[0] < iterations) & jnp.any(unconverged(carry[1]))
 
     start = _decoupled_impulses(problem, guess * problem.active)
-    _, solution = jax.lax.while_loop(continues, newton, (jnp.array(0), at(start, problem.after(start))))
-    return solution.impulses
+    _, last = jax.lax.while_loop(continues, newton, (jnp.array(0), at(start, problem.after(start))))
+    return last.impulses
 
 
 @impulses_of.defjvp
@@ -122,7 +122,7 @@ def _impulses_jvp(
     iterations: int, primals: tuple[ContactProblem, Array], tangents: tuple[ContactProblem, Array]
 ) -> tuple[Array, Array]:
     problem, guess = primals
-    impulses = impulses_of(problem, guess, iterations)
+    impulses = solution(impulses_of(problem, guess, iterations))
     _, change = jax.jvp(lambda primal: primal.impulses_at(primal.after(impulses)), (problem,), (tangents[0],))
     _, slope = problem.impulses_and_slopes_at(problem.after(impulses))
     # dJ + M A dJ = change; M (1 + A M)^-1 = (1 + M A)^-1 M, and dJ = change - M (1 + A M)^-1 A change.
@@ -275,6 +275,8 @@ def _total(values: Array) -> Array:
     return sum(rows[1:], rows[0])
 
 
-def reference_velocity(stiffness: Array, damping: Array, velocity: Array, gap: Array, normal: Array, h: float) -> Array:
+def reference_velocity(
+    stiffness: Array, damping: Array, velocity: Array, gap: Array, normal: Array, h: Array | float
+) -> Array:
     """Return the module's u_ref (C, 3, B) [m/s] of contacts of a velocity u (C, 3, B) [m/s] and a gap (C, 1, B) [m]."""
     return velocity * (1.0 - h * damping / IMPEDANCE) - h * stiffness / IMPEDANCE * gap * normal

@@ -18,8 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model.linalg import barrier, cross, cross_columns, cross_rows, mv
-from larp_model.physics.articulated import Inertia, Momenta, levels_of, solve
+from larp_model.linalg import barrier, combined, cross, cross_columns, cross_rows, mm, mv
+from larp_model.linalg import solution as solved
+from larp_model.physics.admittance import LinkEquations, LinkSystem, eliminated, solution_tangent
+from larp_model.physics.articulated import Inertia, Momenta, levels_of, packed_inertia, solve
 from larp_model.physics.contact import projection
 from larp_model.physics.kinematics import Anchors
 from larp_model.scene import Body
@@ -42,7 +44,8 @@ class Ends(NamedTuple):
 
     @staticmethod
     def of(
-        body: Body, matrices: Array, height: Array, velocity: Array, angular_velocity: Array, sizes: Array, h: float,
+        body: Body, matrices: Array, height: Array, velocity: Array, angular_velocity: Array, sizes: Array,
+        h: Array | float,
         accelerations: tuple[Array, Array],
     ) -> Ends:  # fmt: skip
         """Return the ends of links by rotations (n, 3, 3, B), heights (n, 1, B) [m] and first velocities (n, 3, B).
@@ -66,9 +69,14 @@ class Ends(NamedTuple):
     def at_links(self, masses: Array, momenta: Array) -> tuple[Inertia, Momenta]:
         """Return inertia and momenta of links, from masses (2 n, 3, 3, B) [kg] and momenta (2 n, 3, B) at the ends."""
         mixed, links = cross_columns(self.arm, masses), len(self.arm) // 2
-        added = Inertia(-cross_rows(mixed, self.arm), mixed, masses), Momenta(cross(self.arm, momenta), momenta)
-        totals: tuple[Inertia, Momenta] = jax.tree.map(lambda ends: ends[:links] + ends[links:], added)
-        return totals
+        added = Inertia(-cross_rows(mixed, self.arm), mixed, masses)
+        totals: Inertia = jax.tree.map(lambda ends: ends[:links] + ends[links:], added)
+        return totals, self.momenta_at_links(momenta)
+
+    def momenta_at_links(self, momenta: Array) -> Momenta:
+        """Return momenta of links, from momenta (2 n, 3, B) at the ends."""
+        links = len(self.arm) // 2
+        return Momenta(*(ends[:links] + ends[links:] for ends in (cross(self.arm, momenta), momenta)))
 
 
 class GroundMotion(NamedTuple):
@@ -101,14 +109,17 @@ class GroundProblem(NamedTuple):
     mass: Array
     h: Array | float
 
+    def impulses_at(self, body: Body, velocity: Array, angular_velocity: Array) -> tuple[Array, Array]:
+        """Return impulses (2 n, 3, B) of ends as if all were in the ground, and slopes: see `projection`."""
+        end_velocities = self.ends.velocity(velocity, angular_velocity)
+        up = jnp.broadcast_to(_upright(end_velocities), end_velocities.shape)
+        return projection(self.mass * (self.ends.target_velocity - end_velocities), up, body.surface.friction)
+
     def at(self, body: Body, velocity: Array, angular_velocity: Array, active: Array) -> GroundMotion:
         """Return the motion of velocities (n, 3, B) with its impulses; ends that were `active` before stay so."""
         end_velocities = self.ends.velocity(velocity, angular_velocity)
         active = jnp.maximum(active, ramp(-self.ends.clearance - self.h * end_velocities[:, 2:], 1e-5))
-        up = jnp.broadcast_to(_upright(end_velocities), end_velocities.shape)
-        impulses, slopes = projection(
-            self.mass * (self.ends.target_velocity - end_velocities), up, body.surface.friction
-        )
+        impulses, slopes = self.impulses_at(body, velocity, angular_velocity)
         return GroundMotion(
             velocity,
             angular_velocity,
@@ -173,15 +184,42 @@ def _solution_jvp(
     body: Body, iterations: int, primals: tuple[GroundProblem, GroundMotion],
     tangents: tuple[GroundProblem, GroundMotion],
 ) -> tuple[GroundMotion, GroundMotion]:  # fmt: skip
-    """Differentiate one more step from the solution, where it does not depend on its guess."""
+    """Differentiate the equations that the solution obeys, see `admittance`."""
     problem, guess = primals
-    solution = jax.lax.stop_gradient(_solution(body, iterations, problem, guess))
+    solution: GroundMotion = solved(jax.lax.stop_gradient(_solution(body, iterations, problem, guess)))
+    active = solution.active
+    ground_inertia, _ = problem.ends.at_links(solution.slopes, solution.impulses)
+    ground_blocks = jax.lax.stop_gradient(packed_inertia(ground_inertia))
+    motion = jnp.concatenate([solution.angular_velocity, solution.velocity], axis=1)[:, :, None]
 
-    def step(problem: GroundProblem) -> GroundMotion:
-        at_solution = problem.at(body, solution.velocity, solution.angular_velocity, solution.active)
-        return problem.newton(body, at_solution)
+    def equations(problem: GroundProblem) -> LinkEquations:
+        """Return those that the motion solves, of ground impulses that it calls for and that stay linear around it."""
+        impulses, _ = problem.impulses_at(body, solution.velocity, solution.angular_velocity)
+        momenta = problem.ends.momenta_at_links(active * impulses)
+        wrenches = jnp.concatenate(
+            [problem.momenta.angular + momenta.angular, problem.momenta.linear + momenta.linear], axis=1
+        )
+        servos = combined(_differences(body), problem.impulse)
+        wrenches = wrenches.at[:, :3].add(servos)[:, :, None] + mm(ground_blocks, motion)
+        system = LinkSystem(packed_inertia(problem.inertia) + ground_blocks, problem.anchors, problem.resistance)
+        return LinkEquations(system, wrenches, problem.closing[:, :, None])
 
-    return solution, jax.jvp(step, (problem,), tangents[:1])[1]
+    values, tangent = jax.jvp(equations, (problem,), tangents[:1])
+    change = solution_tangent(body, eliminated(body, values.system), motion, values, tangent)[:, :, 0]
+    velocity_tangents = change[:, 3:], change[:, :3]
+    _, solution_tangents = jax.jvp(
+        lambda problem, *velocities: problem.at(body, *velocities, active),
+        (problem, solution.velocity, solution.angular_velocity),
+        (tangents[0], *velocity_tangents),
+    )
+    return solution, solution_tangents
+
+
+def _differences(body: Body) -> np.ndarray:
+    """Return (n, n - 1) 1 where a link is a joint's child, -1 where it is a joint's parent, else 0."""
+    links = np.arange(len(body.links))[:, None]
+    matrix: np.ndarray = (links == np.arange(1, len(body.links))) * 1.0 - (links == body.parents) * 1.0
+    return matrix
 
 
 def ramp(value: Array, width: float) -> Array:

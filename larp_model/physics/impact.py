@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model.linalg import cross, cross_columns, cross_rows, mv
+from larp_model.linalg import contract, cross, cross_columns, cross_rows, mv, solution
 from larp_model.physics import contact
 from larp_model.physics.articulated import Momenta
 from larp_model.physics.collision import (
@@ -72,7 +72,7 @@ def integrate(
     rates: Rates,
     articulations: dict[str, Articulation],
     gaps: Array,
-    dt: float,
+    dt: Array | float,
     settings: ContactSettings,
 ) -> BodyMotion:
     """Return the motion (L, 3, B) of all links that contacts within `dt` [s] add; see the module.
@@ -81,7 +81,7 @@ def integrate(
     """
     candidates = Candidates(scene)
     count = min(settings.contacts, len(gaps))
-    selection = jax.nn.one_hot(jnp.argsort(gaps, axis=0)[:count], len(gaps), axis=1, dtype=gaps.dtype)
+    selection = jax.nn.one_hot(solution(jnp.argsort(gaps, axis=0)[:count]), len(gaps), axis=1, dtype=gaps.dtype)
     sides = sides_of(candidates, selection)
     side_gains = {
         name: _side_gains(scene, name, articulation, sides, links.sizes, settings)
@@ -192,7 +192,7 @@ class ContactSystem:
         selection: Array,
         sides: Sides,
         side_gains: SideGains,
-        dt: float,
+        dt: Array | float,
         settings: ContactSettings,
     ) -> None:
         scene, balls = candidates.scene, candidates.balls
@@ -216,8 +216,8 @@ class ContactSystem:
         )
         self.mass = self._mass()
         # Decay of transient velocities over a substep, and over half of it.
-        self.decay = float(np.exp(-self.h / settings.fade))
-        self.half_decay = float(np.exp(-0.5 * self.h / settings.fade))
+        self.decay = jnp.exp(-self.h / settings.fade)
+        self.half_decay = jnp.exp(-0.5 * self.h / settings.fade)
 
     def _constants(
         self, name: str, selection: Array, of_pairs: Sequence[Surface], of_balls: Sequence[Surface]
@@ -382,6 +382,4 @@ def _scattered(parts: Array, rows: np.ndarray, count: int) -> Array:
 
 def _summed(gains: Array, wrench: Array) -> Array:
     """Return (n, 3, B) gains (2, n, 3, k, B) times wrenches (2, k, B), lasting and transient together."""
-    # A sum of slices: XLA hands a reduction to a library that takes ten times as long to begin.
-    terms = [gains[part, :, :, k] * wrench[part, k] for part in range(2) for k in range(wrench.shape[1])]
-    return sum(terms[1:], terms[0])
+    return contract("pnik,pk->ni", gains, wrench)

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from larp_model import state as packed
-from larp_model.linalg import cross, mv, rotation_matrices
+from larp_model.linalg import cross, mv, rotation_matrices, rows
 from larp_model.scene import Body, Scene, Vector
 
 
@@ -80,24 +80,24 @@ def kinematics(scene: Scene, state: Array, sizes: Array) -> Kinematics:
         local_anchors(scene, parents, [joint.parent_anchor for *_, joint in joints], sizes),
     )
     anchors = turned_anchors(local, matrices, children, parents)
-    displacement = position[children] + anchors.child - (position[parents] + anchors.parent)
+    displacement = rows(position, children) + anchors.child - (rows(position, parents) + anchors.parent)
     return Kinematics(state, sizes, matrices, half, local, displacement)
 
 
-def turned_anchors(local: Anchors, matrices: Array, children: np.ndarray | slice, parents: np.ndarray) -> Anchors:
+def turned_anchors(local: Anchors, matrices: Array, children: np.ndarray, parents: np.ndarray) -> Anchors:
     """Return joint anchors in the world's axes, of links turned by matrices (L, 3, 3, B); rows of both ends (J,)."""
-    return Anchors(mv(matrices[children], local.child), mv(matrices[parents], local.parent))
+    return Anchors(mv(rows(matrices, children), local.child), mv(rows(matrices, parents), local.parent))
 
 
-def local_anchors(scene: Scene, rows: np.ndarray, points: list[Vector], sizes: Array) -> Array:
-    """Return joint anchors (J, 3, B) [m] in the frames of the links in these rows, of sizes (L, 3, B).
+def local_anchors(scene: Scene, links: np.ndarray, points: list[Vector], sizes: Array) -> Array:
+    """Return joint anchors (J, 3, B) [m] in the frames of the links in these rows (`links`), of sizes (L, 3, B).
 
     points: in shares of half the length along the link's axis, and of the radius across it, see `Joint`.
     """
-    axis = np.array([scene.links[row].axis for row in rows], np.float32).reshape(-1, 3)
+    axis = np.array([scene.links[row].axis for row in links], np.float32).reshape(-1, 3)
     point = np.array(points, np.float32).reshape(-1, 3)
     along = np.sum(axis * point, axis=-1, keepdims=True) * axis
-    length, radius = sizes[rows, 0:1], sizes[rows, 1:2]
+    length, radius = rows(sizes[:, 0:1], links), rows(sizes[:, 1:2], links)
     anchors: Array = 0.5 * length * along[..., None] + radius * (point - along)[..., None]
     return anchors
 
@@ -120,7 +120,9 @@ def motor_scale(body: Body, sizes: Array) -> Array:
     return jnp.sum(sizes[:, 0], axis=0) * jnp.sum(sizes[:, 2], axis=0) / body.mass_length
 
 
-def ends_on_ground(links: Kinematics, velocity: Array, angular_velocity: Array, dt: float) -> tuple[Array, Array]:
+def ends_on_ground(
+    links: Kinematics, velocity: Array, angular_velocity: Array, dt: Array | float
+) -> tuple[Array, Array]:
     """Return velocities (2 n, 3, B) of both ends of every link, times their nearness, and features (6 n, B).
 
     velocity, angular_velocity: of the links (n, 3, B). Features: clearance [m] over the ground, nearness (1 on the

@@ -17,8 +17,8 @@ import numpy as np
 from jax import Array
 
 from larp_model import rotation
-from larp_model.linalg import barrier, cross, dot, mm, mv, rotated, rotation_matrices
-from larp_model.physics.articulated import Inertia, Momenta, tree
+from larp_model.linalg import barrier, combined, cross, dot, mm, mv, outer, rotated, rotation_matrices, rows
+from larp_model.physics.articulated import Inertia, Momenta
 from larp_model.physics.ground import Ends, GroundProblem, motion_on_ground
 from larp_model.physics.kinematics import Anchors, Kinematics, motor_scale, turned_anchors
 from larp_model.scene import Body
@@ -97,7 +97,7 @@ class BodyInputs(NamedTuple):
 
 
 def articulated_motion(
-    body: Body, links: Kinematics, targets: Array, torques: Array, gravity: float, dt: float,
+    body: Body, links: Kinematics, targets: Array, torques: Array, gravity: float, dt: Array | float,
     constants: Constants = Constants(),
 ) -> tuple[BodyMotion, Articulation]:  # fmt: skip
     """Return the motion of a body within `dt` [s] if nothing but the ground touches it, and its inertia meanwhile.
@@ -136,17 +136,17 @@ def articulated_motion(
     return motion, Articulation(inertia, anchors, jerk, angular_jerk)
 
 
-def _stage(body: Body, constants: Constants, inputs: BodyInputs, start: StageStart, h: float) -> StageEnd:
+def _stage(body: Body, constants: Constants, inputs: BodyInputs, start: StageStart, h: Array | float) -> StageEnd:
     """Return the end of a stage of `h` [s]."""
     links, targets, torques, gravity, scale, closing = inputs
     velocity, angular_velocity, sizes = start.velocity, start.angular_velocity, links.sizes
-    parents = np.array([joint.parent for joint in body.joints], int)
+    parents = body.parents
     orientation = rotated(links.orientation, start.rotation_vector)
     end_matrices = rotation_matrices(rotated(orientation, h * angular_velocity))
     inertia = inertias(body, end_matrices, sizes)
     momentum, mass = mv(inertia.angular, angular_velocity), sizes[:, 2:3]
     momenta = Momenta(momentum + h * (torques - cross(angular_velocity, momentum)), mass * (velocity + h * gravity))
-    anchors = turned_anchors(links.local_anchors, end_matrices, slice(1, None), parents)
+    anchors = turned_anchors(links.local_anchors, end_matrices, np.arange(1, len(body.links)), parents)
     matrices = rotation_matrices(orientation)
     impulse, resistance = servos(body, orientation, matrices, targets, angular_velocity, h, scale)
     height = links.position[:, 2:] + start.rise
@@ -168,29 +168,25 @@ def velocity_products(body: Body, anchors: Anchors, angular_velocity: Array) -> 
 
     MuJoCo leaves them out of a contact's acceleration. anchors: from links' centres to their joints.
     """
-    parents = np.array([joint.parent for joint in body.joints], int)
+    child_turning, parent_turning = angular_velocity[1:], rows(angular_velocity, body.parents)
     # Relative acceleration of the two points of a joint as their links turn, and of the joint's axes with the child.
-    separation = cross(angular_velocity[parents], cross(angular_velocity[parents], anchors.parent))
-    separation -= cross(angular_velocity[1:], cross(angular_velocity[1:], anchors.child))
-    relative = cross(angular_velocity[1:], angular_velocity[1:] - angular_velocity[parents])
-    linear = angular = jnp.zeros_like(angular_velocity[:1])
-    rows = np.array([0])
-    for level, level_parents in tree(body):
-        parent_rows, joint = np.array([int(np.flatnonzero(rows == row)[0]) for row in level_parents]), level - 1
-        outer = angular[parent_rows] + relative[joint]
-        translated = (
-            linear[parent_rows]
-            + cross(angular[parent_rows], anchors.parent[joint])
-            - cross(outer, anchors.child[joint])
-        )
-        linear, angular = jnp.concatenate([linear, translated + separation[joint]]), jnp.concatenate([angular, outer])
-        rows = np.concatenate([rows, level])
-    order = np.argsort(rows)
-    return linear[order], angular[order]
+    separation = cross(parent_turning, cross(parent_turning, anchors.parent))
+    separation -= cross(child_turning, cross(child_turning, anchors.child))
+    relative = cross(child_turning, child_turning - parent_turning)
+    # Both add up along the joints to the root.
+    angular = combined(body.ancestors, relative)
+    separation += cross(rows(angular, body.parents), anchors.parent) - cross(angular[1:], anchors.child)
+    return combined(body.ancestors, separation), angular
 
 
 def servos(
-    body: Body, orientation: Array, matrices: Array, targets: Array, angular_velocity: Array, h: float, scale: Array
+    body: Body,
+    orientation: Array,
+    matrices: Array,
+    targets: Array,
+    angular_velocity: Array,
+    h: Array | float,
+    scale: Array,
 ) -> tuple[Array, Array]:
     """Return impulse (n - 1, 3, B) and resistance (n - 1, 3, 3, B) of all joints within `h` [s]; see `articulated`.
 
@@ -208,15 +204,15 @@ def servos(
             motors[:, child, 0, 0] = motor.stiffness, motor.torque_limit, motor.armature, motor.damping
             motor_rows.append(child)
     stiffness, limit, armature, damping = scale * jnp.asarray(motors)
-    parents = np.array([joint.parent for joint in body.joints], int)
+    parents = body.parents
     matrices = matrices[1:]
     unit = jnp.eye(3, dtype=angular_velocity.dtype)[..., None]
     damping_and_armature = armature + h * (damping + passive)
-    impulse = armature * (angular_velocity[1:] - angular_velocity[parents])
+    impulse = armature * (angular_velocity[1:] - rows(angular_velocity, parents))
     if not motor_rows:
         return impulse, jnp.broadcast_to(damping_and_armature[:, :, None] * unit, (links - 1, 3, 3, batch))
     padded_targets = padded_targets.at[np.array(motor_rows)].set(targets)
-    torque = stiffness * (padded_targets - angles(orientation[parents], orientation[1:]))
+    torque = stiffness * (padded_targets - angles(rows(orientation, parents), orientation[1:]))
     spring = h**2 * stiffness * (jnp.abs(torque) < limit)
     resistance = mm(matrices * spring[:, None], jnp.swapaxes(matrices, 1, 2)) + damping_and_armature[:, :, None] * unit
     return impulse + h * mv(matrices, jnp.clip(torque, -limit, limit)), resistance
@@ -244,8 +240,7 @@ def inertias(body: Body, matrices: Array, sizes: Array) -> Inertia:
     along, across = moments(sizes[:, 0], sizes[:, 1], sizes[:, 2])
     axes = np.array([link.axis for link in body.links], np.float32)
     axis = mv(matrices, jnp.asarray(axes, matrices.dtype)[..., None])
-    outer = axis[:, :, None] * axis[:, None, :]
     unit = jnp.eye(3, dtype=matrices.dtype)[..., None]
-    angular = across[:, None, None] * unit + (along - across)[:, None, None] * outer
+    angular = across[:, None, None] * unit + (along - across)[:, None, None] * outer(axis, axis)
     linear = jnp.broadcast_to(sizes[:, 2][:, None, None] * unit, angular.shape)
     return Inertia(angular, jnp.zeros_like(angular), linear)

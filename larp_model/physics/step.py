@@ -6,6 +6,8 @@ Where links touch within a step, the scene's step is taken in two halves, each w
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -13,17 +15,19 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model.linalg import rotated
-from larp_model.physics.ball import ball_motion, flight
+from larp_model.linalg import rotated, solution
+from larp_model.physics.ball import ball_motion
 from larp_model.physics.collision import Candidates, ContactSettings, Rates
 from larp_model.physics.impact import integrate
 from larp_model.physics.kinematics import Kinematics, kinematics
 from larp_model.physics.motion import Articulation, BodyMotion, Constants, articulated_motion, velocity_products
 from larp_model.scene import Body, Scene
 
-# Number of scenes with contacts that are stepped at a time on a CPU: more do not fit into the caches of a core. A GPU
-# takes all at once, which is 13 times faster at 512 of them.
-CHUNK = 32
+# Number of scenes that are stepped at a time on a CPU: more do not fit into the caches of a core. A GPU takes all at
+# once, which is 13 times faster at 512 of them.
+CHUNK = 128
+# What reverse mode keeps of a step: see `linalg.solution`.
+KEPT = jax.checkpoint_policies.save_only_these_names("solution")
 
 
 class StepInputs(NamedTuple):
@@ -35,10 +39,7 @@ class StepInputs(NamedTuple):
     sizes: Array
 
 
-BallMotion = Callable[[Body, Kinematics, Array, float, float], BodyMotion]
-"""(body, kinematics, torques (1, 3, B), gravity, dt [s]) -> motion (1, 3, B) each."""
-
-Correction = Callable[[Body, Kinematics, BodyMotion, float], BodyMotion]
+Correction = Callable[[Body, Kinematics, BodyMotion, Array | float], BodyMotion]
 """(body, kinematics, motion (n, 3, B) each, dt [s]) -> motion that a network has corrected."""
 
 
@@ -53,68 +54,136 @@ def step(
     """
     before, targets, torques, sizes = (jnp.moveaxis(array, 0, -1) for array in (state, control, torque, morphology))
     start = StepInputs(before, targets, torques, jnp.broadcast_to(sizes, (*sizes.shape[:2], state.shape[0])))
-    candidates = Candidates(scene)
+    return jnp.moveaxis(SceneStep(scene, constants, settings, correct).run(start), -1, 0)
+
+
+@dataclass(frozen=True)
+class SceneStep:
+    """A step of a scene: whole where no links touch each other, else in two halves, each with its contacts.
+
+    Reverse-mode derivatives keep the states before each part and the solutions of its equations, and compute the rest
+    again: what a rollout keeps does not grow with the number of operations in a step.
+    """
+
+    scene: Scene
+    constants: Constants
+    settings: ContactSettings
+    correct: Correction
+
+    def run(self, start: StepInputs) -> Array:
+        """Return states (L, 13, B) after the step, of `CHUNK` scenes at a time on a CPU.
+
+        No scene of a chunk takes contacts where none has any: so scenes are sorted by their gaps.
+        """
+        count = start.state.shape[-1]
+        # The count may be a symbol: see `jax.export`.
+        if not isinstance(count, int) or count <= CHUNK or jax.default_backend() != "cpu":
+            return self.chunk(start)
+        order = jnp.argsort(self.rough_gaps(jax.lax.stop_gradient(start)))
+        chunks = order[np.minimum(np.arange(count + -count % CHUNK), count - 1)].reshape(-1, CHUNK)
+
+        def chunk(_: None, numbers: Array) -> tuple[None, Array]:
+            return None, self.chunk(jax.tree.map(lambda array: array[..., numbers], start))
+
+        _, after = jax.lax.scan(chunk, None, chunks)
+        return jnp.moveaxis(after, 0, -2).reshape(*start.state.shape[:2], -1)[..., jnp.argsort(order)]
+
+    def rough_gaps(self, start: StepInputs) -> Array:
+        """Return the smallest gaps (B,) [m] between links within a step at constant velocities."""
+        scene, settings = self.scene, replace(self.settings, moments=2)
+        if not scene.pairs:
+            return jnp.zeros(start.state.shape[-1])
+        links = kinematics(scene, start.state, start.sizes)
+        constant = Rates(*[jnp.zeros_like(links.velocity)] * len(Rates._fields))
+        return jnp.min(Candidates(scene).gaps(links, constant, scene.dt, settings), axis=0)
+
+    def chunk(self, start: StepInputs) -> Array:
+        """Return states (L, 13, B) after a step."""
+        if not self.scene.pairs:
+            return self.part(start, start.state, self.scene.dt, True)[0]
+
+        def part(carry: tuple[Array, Array, Array], whole: Array) -> tuple[tuple[Array, Array, Array], None]:
+            state, after, near = carry
+            dt = jnp.where(whole, self.scene.dt, 0.5 * self.scene.dt)
+            moved, touching = jax.lax.cond(
+                whole | jnp.any(near),
+                lambda state: self.part(start, state, dt, whole),
+                lambda state: (state, near),
+                state,
+            )
+            states = jnp.where(whole, state, moved), jnp.where(whole, moved, after)
+            return (*states, jnp.where(whole, touching, near)), None
+
+        nowhere = jnp.zeros(start.state.shape[-1], bool)
+        # One program for the whole step and the two halves: it is compiled once.
+        (halves, whole, near), _ = jax.lax.scan(
+            part, (start.state, start.state, nowhere), jnp.array([True, False, False])
+        )
+        return jnp.where(near, halves, whole)
+
+    def part(self, start: StepInputs, state: Array, dt: Array | float, whole: Array | bool) -> tuple[Array, Array]:
+        """Return states (L, 13, B) `dt` [s] after others, without contacts of links where the step is whole.
+
+        And where (B,) links touch meanwhile.
+        """
+
+        @partial(jax.checkpoint, prevent_cse=False, policy=KEPT)
+        def part(state: Array) -> tuple[Array, Array]:
+            links = kinematics(self.scene, state, start.sizes)
+            motion, articulations = self.free_motion(start, links, dt, whole)
+            if not self.scene.pairs:
+                return _after(links, motion), jnp.zeros(state.shape[-1], bool)
+            rates = _rates(self.scene, links, motion, articulations, dt)
+            fixed_links, fixed_rates = jax.lax.stop_gradient((links, rates))
+            gaps = Candidates(self.scene).gaps(fixed_links, fixed_rates, dt, self.settings)
+            added = self.contact_motion(links, rates, articulations, gaps, dt, whole)
+            total = BodyMotion(*(own + more for own, more in zip(motion, added, strict=True)))
+            return _after(links, total), jnp.min(gaps, axis=0) < self.settings.margin
+
+        after: tuple[Array, Array] = part(state)
+        return after
 
     def free_motion(
-        inputs: StepInputs, links: Kinematics, dt: float, of_balls: BallMotion
+        self, start: StepInputs, links: Kinematics, dt: Array | float, whole: Array | bool
     ) -> tuple[BodyMotion, dict[str, Articulation]]:
-        motions, articulations = [], {}
+        """Return the motion of all links, each body on its own, and the inertia of articulated bodies by name.
+
+        In halves balls are integrated with all that touches them, the ground as well: see `impact`.
+        """
+        scene, motions, articulations = self.scene, [], {}
         for body in scene.bodies:
-            body_links, torques = links.of(scene, body.name), inputs.torques[scene.rows(body.name)]
+            body_links, torques = links.of(scene, body.name), start.torques[scene.rows(body.name)]
             if body.is_ball:
-                motion = of_balls(body, body_links, torques, scene.gravity, dt)
+                motion = ball_motion(body, body_links, torques, scene.gravity, dt, whole)
             else:
-                targets = inputs.targets[scene.motor_rows(body.name)]
+                targets = start.targets[scene.motor_rows(body.name)]
                 motion, articulations[body.name] = articulated_motion(
-                    body, body_links, targets, torques, scene.gravity, dt, constants
+                    body, body_links, targets, torques, scene.gravity, dt, self.constants
                 )
-            motions.append(correct(body, body_links, motion, dt))
+            motions.append(self.correct(body, body_links, motion, dt))
         return BodyMotion(*(jnp.concatenate(array) for array in zip(*motions, strict=True))), articulations
 
-    def half(inputs: StepInputs, _: None) -> tuple[StepInputs, None]:
-        dt, links = 0.5 * scene.dt, kinematics(scene, inputs.state, inputs.sizes)
-        # Balls are integrated with all that touches them, the ground as well.
-        motion, articulations = free_motion(inputs, links, dt, flight)
-        rates = _rates(scene, links, motion, articulations, dt)
-        contact_motion = integrate(
-            scene, links, rates, articulations, candidates.gaps(links, rates, dt, settings), dt, settings
-        )
-        total = BodyMotion(*(own + more for own, more in zip(motion, contact_motion, strict=True)))
-        return inputs._replace(state=_after(links, total)), None
+    def contact_motion(
+        self, links: Kinematics, rates: Rates, articulations: dict[str, Articulation], gaps: Array,
+        dt: Array | float, whole: Array | bool,
+    ) -> BodyMotion:  # fmt: skip
+        """Return the motion that contacts add, none in a whole step; see `impact.integrate`."""
 
-    links = kinematics(scene, start.state, start.sizes)
-    motion, articulations = free_motion(start, links, scene.dt, ball_motion)
-    after = _after(links, motion)
-    if scene.pairs:
-        rates = _rates(scene, links, motion, articulations, scene.dt)
-        gaps = candidates.gaps(links, rates, scene.dt, settings)
-        near = jnp.min(gaps, axis=0) < settings.margin
-        after = _where(near, lambda inputs: jax.lax.scan(half, inputs, length=2)[0].state, start, after)
-    return jnp.moveaxis(after, -1, 0)
+        @partial(jax.checkpoint, prevent_cse=False, policy=KEPT)
+        def contacts(
+            links: Kinematics, rates: Rates, articulations: dict[str, Articulation], gaps: Array
+        ) -> BodyMotion:
+            return integrate(self.scene, links, rates, articulations, gaps, dt, self.settings)
 
+        def none(links: Kinematics, *_: object) -> BodyMotion:
+            return BodyMotion(*[jnp.zeros_like(links.velocity)] * len(BodyMotion._fields))
 
-def _where(near: Array, contact_step: Callable[[StepInputs], Array], start: StepInputs, otherwise: Array) -> Array:
-    """Return states (L, 13, B) by `contact_step` where near (B,), chunk by chunk, and the other states elsewhere."""
-    count = near.shape[0]
-    # The count may be a symbol: see `jax.export`.
-    size = min(CHUNK, count) if isinstance(count, int) and jax.default_backend() == "cpu" else count
-    if size == count:
-        refined = jax.lax.cond(jnp.any(near), contact_step, lambda inputs: inputs.state, start)
-        return jnp.where(near, refined, otherwise)
-    order = jnp.argsort(~near)
-    rows = order[np.minimum(np.arange(count + -count % size), count - 1)].reshape(-1, size)
-
-    def chunk(_: None, rows: Array) -> tuple[None, Array]:
-        chunk_inputs: StepInputs = jax.tree.map(lambda array: array[..., rows], start)
-        return None, jax.lax.cond(jnp.any(near[rows]), contact_step, lambda inputs: inputs.state, chunk_inputs)
-
-    _, chunks = jax.lax.scan(chunk, None, rows)
-    refined = jnp.moveaxis(chunks, 0, -2).reshape(*otherwise.shape[:2], -1)[..., jnp.argsort(order)]
-    return jnp.where(near, refined, otherwise)
+        motion: BodyMotion = solution(jax.lax.cond(whole, none, contacts, links, rates, articulations, gaps))
+        return motion
 
 
 def _rates(
-    scene: Scene, links: Kinematics, motion: BodyMotion, articulations: dict[str, Articulation], dt: float
+    scene: Scene, links: Kinematics, motion: BodyMotion, articulations: dict[str, Articulation], dt: Array | float
 ) -> Rates:
     """Return the accelerations of all links of a scene, from the motion of its bodies within `dt` [s]."""
     rates = []
