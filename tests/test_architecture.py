@@ -155,6 +155,7 @@ ORDER = [
     "tasks.benchmarks.engines",
     "tasks.benchmarks.replays",
     "tasks.benchmarks.speed",
+    "tasks.benchmarks.compilation",
     "tasks.benchmarks.tradeoff",
     "tasks.benchmarks.optimizers",
     "tasks.benchmarks.promises",

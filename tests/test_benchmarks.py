@@ -7,12 +7,14 @@ import re
 from functools import partial
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import pytest
 from rich.table import Table
 
 from larp_model.errors import InputError
 from mpc import CEM
-from tasks.benchmarks import kick, report
+from tasks.benchmarks import compilation, kick, report
 from tasks.presets import PRESETS, Preset
 
 
@@ -128,3 +130,19 @@ def test_many_bodies_have_neither_one_height_nor_one_budget(tmp_path: Path) -> N
     for asked in ({"height": 1.6}, {"budget": 1.0}):
         with pytest.raises(InputError, match="bodies is 'varied', but height and budget are those of one body"):
             kick.main(json=tmp_path / "kick.json", bodies="varied", **asked)  # type: ignore[arg-type]
+
+
+def test_the_cost_of_compiling_counts_a_loops_body_once_and_measures_all() -> None:
+    def loop(value: jax.Array) -> jax.Array:
+        return jax.lax.scan(lambda carry, _: (jnp.sin(carry) * 2.0, None), value, length=50)[0]
+
+    row = compilation.cost(compilation.gradient_of(loop), (jnp.ones(4),))
+    assert 4 < row["operations"] < 50 < row["hlo"]
+    assert min(row["trace_s"], row["xla_s"], row["run_ms"]) > 0.0
+    assert row["memory_mb"] >= 1e-6 * 4 * 4 * 50, "reverse mode keeps a number of each step"
+
+
+def test_the_cost_of_compiling_nothing_is_refused(tmp_path: Path) -> None:
+    for name, ask in (("batch", partial(compilation.main, batch=0)), ("steps", partial(compilation.main, steps=0))):
+        with pytest.raises(InputError, match=f"{name} is 0, but must be at least 1"):
+            ask(json=tmp_path / "some.json")

@@ -129,19 +129,27 @@ class SceneStep:
 
         @partial(jax.checkpoint, prevent_cse=False, policy=KEPT)
         def part(state: Array) -> tuple[Array, Array]:
-            links = kinematics(self.scene, state, start.sizes)
-            motion, articulations = self.free_motion(start, links, dt, whole)
             if not self.scene.pairs:
-                return _after(links, motion), jnp.zeros(state.shape[-1], bool)
-            rates = _rates(self.scene, links, motion, articulations, dt)
-            fixed_links, fixed_rates = jax.lax.stop_gradient((links, rates))
-            gaps = Candidates(self.scene).gaps(fixed_links, fixed_rates, dt, self.settings)
+                links = kinematics(self.scene, state, start.sizes)
+                return _after(links, self.free_motion(start, links, dt, whole)[0]), jnp.zeros(state.shape[-1], bool)
+            motion, links, rates, articulations, gaps = self.before_contacts(start, state, dt, whole)
             added = self.contact_motion(links, rates, articulations, gaps, dt, whole)
             total = BodyMotion(*(own + more for own, more in zip(motion, added, strict=True)))
             return _after(links, total), jnp.min(gaps, axis=0) < self.settings.margin
 
         after: tuple[Array, Array] = part(state)
         return after
+
+    def before_contacts(
+        self, start: StepInputs, state: Array, dt: Array | float, whole: Array | bool
+    ) -> tuple[BodyMotion, Kinematics, Rates, dict[str, Articulation], Array]:
+        """Return all that contacts within `dt` [s] depend on: see `impact.integrate`; and the motion without them."""
+        links = kinematics(self.scene, state, start.sizes)
+        motion, articulations = self.free_motion(start, links, dt, whole)
+        rates = _rates(self.scene, links, motion, articulations, dt)
+        fixed_links, fixed_rates = jax.lax.stop_gradient((links, rates))
+        gaps = Candidates(self.scene).gaps(fixed_links, fixed_rates, dt, self.settings)
+        return motion, links, rates, articulations, gaps
 
     def free_motion(
         self, start: StepInputs, links: Kinematics, dt: Array | float, whole: Array | bool

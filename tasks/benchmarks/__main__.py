@@ -2,13 +2,26 @@
 
 from collections.abc import Callable
 
-from tasks.benchmarks import gap, kick, model, optimizers, page, pose, reference, speed, stability, tradeoff
+from tasks.benchmarks import (
+    compilation,
+    gap,
+    kick,
+    model,
+    optimizers,
+    page,
+    pose,
+    reference,
+    speed,
+    stability,
+    tradeoff,
+)
 from tasks.command import run
 
 NAMED: dict[str, Callable[..., None]] = {
     "kick": kick.main,
     "model": model.main,
     "speed": speed.main,
+    "compilation": compilation.main,
     "tradeoff": tradeoff.main,
     "optimizers": optimizers.main,
     "gap": gap.main,
