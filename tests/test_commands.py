@@ -5,10 +5,11 @@ from __future__ import annotations
 import errno
 import io
 import os
+import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.metadata import entry_points, version
 from pathlib import Path
 from typing import TextIO
@@ -170,6 +171,15 @@ def test_ctrl_c_in_a_program_that_calls_back_ends_the_command(capsys: pytest.Cap
     assert ended.value.code == 130 and capsys.readouterr().err == "error: interrupted\n"
 
 
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Ctrl-C as at a terminal: a shell that starts the tests in the background has it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_while_garbage_is_collected_is_not_lost(capsys: pytest.CaptureFixture[str]) -> None:
     class Garbage:
         def __del__(self) -> None:

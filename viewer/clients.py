@@ -63,7 +63,8 @@ class Clients:
         """Move the cameras of clients that follow the ball to its position (3,) [m]."""
         for number, client in self._server.get_clients().items():
             if self.views.get(number, ("",))[0] == "follow":
-                with client.atomic(), suppress(ValueError):  # of a client whose camera is invalid
+                # Of a client whose camera is invalid, or that has left meanwhile, where warnings are errors.
+                with client.atomic(), suppress(ValueError, UserWarning):
                     client.camera.position, client.camera.look_at = ball + FOLLOWED, ball
 
     def download(self, client: viser.ClientHandle, kind: str, recording: Recording | None, files: Files | None) -> None:
