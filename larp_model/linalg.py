@@ -155,9 +155,9 @@ def barrier(arrays: Arrays) -> Arrays:
     return same
 
 
-def solution(arrays: Arrays) -> Arrays:
-    """Return the result of an iteration as it is: gradients keep it, rather than iterate again."""
-    named: Arrays = checkpoint_name(arrays, "solution")
+def saved(arrays: Arrays) -> Arrays:
+    """Return arrays as they are; reverse mode saves them, and does not compute them again (`physics.step.SAVED`)."""
+    named: Arrays = checkpoint_name(arrays, "saved")
     return named
 
 

@@ -154,7 +154,7 @@ def _residuals(body: Body, equations: LinkEquations, motion: Array, joint_impuls
     torques = -mm(resistance, turning - parent_turning)
     at_child = jnp.concatenate([torques + cross_columns(anchors.child, joint_impulses), joint_impulses], axis=1)
     at_parent = jnp.concatenate([torques + cross_columns(anchors.parent, joint_impulses), joint_impulses], axis=1)
-    imbalance = wrenches + combined(_incidence(body), jnp.concatenate([at_child, -at_parent])) - mm(inertia, motion)
+    imbalance = wrenches + on_links(body, at_child, at_parent) - mm(inertia, motion)
     child_point, parent_point = (
         moving - cross_columns(anchors.child, turning),
         parent_moving - cross_columns(anchors.parent, parent_turning),
@@ -168,8 +168,8 @@ def _joint_impulses(body: Body, equations: LinkEquations, motion: Array) -> Arra
     return combined(body.ancestors.T, gained)
 
 
-def _incidence(body: Body) -> np.ndarray:
-    """Return (n, 2 (n - 1)) 1 where a link is a joint's child, then where it is a joint's parent, else 0."""
+def on_links(body: Body, at_child: Array, at_parent: Array) -> Array:
+    """Return sums (n, ..., B) on links of what joints exert (n - 1, ..., B) on children, and against their parents."""
     links = np.arange(len(body.links))[:, None]
-    children = np.arange(1, len(body.links))
-    return np.concatenate([links == children, links == body.parents], axis=1)
+    incidence = np.concatenate([links == np.arange(1, len(body.links)), links == body.parents], axis=1)
+    return combined(incidence, jnp.concatenate([at_child, -at_parent]))

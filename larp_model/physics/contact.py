@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model.linalg import barrier, dot, inverse, mm, mv, solution
+from larp_model.linalg import barrier, dot, inverse, mm, mv, saved
 
 # The share of the constraint that is a spring; the rest follows the free motion (MuJoCo's impedance).
 IMPEDANCE = 0.99
@@ -113,8 +113,8 @@ def impulses_of(problem: ContactProblem, guess: Array, iterations: int) -> Array
         return (carry[0] < iterations) & jnp.any(unconverged(carry[1]))
 
     start = _decoupled_impulses(problem, guess * problem.active)
-    _, last = jax.lax.while_loop(continues, newton, (jnp.array(0), at(start, problem.after(start))))
-    return last.impulses
+    _, solution = jax.lax.while_loop(continues, newton, (jnp.array(0), at(start, problem.after(start))))
+    return solution.impulses
 
 
 @impulses_of.defjvp
@@ -122,7 +122,7 @@ def _impulses_jvp(
     iterations: int, primals: tuple[ContactProblem, Array], tangents: tuple[ContactProblem, Array]
 ) -> tuple[Array, Array]:
     problem, guess = primals
-    impulses = solution(impulses_of(problem, guess, iterations))
+    impulses = saved(impulses_of(problem, guess, iterations))
     _, change = jax.jvp(lambda primal: primal.impulses_at(primal.after(impulses)), (problem,), (tangents[0],))
     _, slope = problem.impulses_and_slopes_at(problem.after(impulses))
     # dJ + M A dJ = change; M (1 + A M)^-1 = (1 + M A)^-1 M, and dJ = change - M (1 + A M)^-1 A change.

@@ -18,9 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model.linalg import barrier, combined, cross, cross_columns, cross_rows, mm, mv
-from larp_model.linalg import solution as solved
-from larp_model.physics.admittance import LinkEquations, LinkSystem, eliminated, solution_tangent
+from larp_model.linalg import barrier, cross, cross_columns, cross_rows, mm, mv, saved
+from larp_model.physics.admittance import LinkEquations, LinkSystem, eliminated, on_links, solution_tangent
 from larp_model.physics.articulated import Inertia, Momenta, levels_of, packed_inertia, solve
 from larp_model.physics.contact import projection
 from larp_model.physics.kinematics import Anchors
@@ -66,12 +65,12 @@ class Ends(NamedTuple):
         """Return the ends' velocities (2 n, 3, B), from those of the links."""
         return twice(velocity) + cross(twice(angular_velocity), self.arm)
 
-    def at_links(self, masses: Array, momenta: Array) -> tuple[Inertia, Momenta]:
-        """Return inertia and momenta of links, from masses (2 n, 3, 3, B) [kg] and momenta (2 n, 3, B) at the ends."""
+    def inertia_at_links(self, masses: Array) -> Inertia:
+        """Return the inertia of links, from masses (2 n, 3, 3, B) [kg] at the ends."""
         mixed, links = cross_columns(self.arm, masses), len(self.arm) // 2
         added = Inertia(-cross_rows(mixed, self.arm), mixed, masses)
         totals: Inertia = jax.tree.map(lambda ends: ends[:links] + ends[links:], added)
-        return totals, self.momenta_at_links(momenta)
+        return totals
 
     def momenta_at_links(self, momenta: Array) -> Momenta:
         """Return momenta of links, from momenta (2 n, 3, B) at the ends."""
@@ -131,7 +130,8 @@ class GroundProblem(NamedTuple):
     def linear(self, guess: GroundMotion) -> tuple[Inertia, Momenta]:
         """Return inertia and momenta that impulses, linear around a guess, add to those of the links."""
         end_velocities = self.ends.velocity(guess.velocity, guess.angular_velocity)
-        return self.ends.at_links(guess.slopes, guess.impulses + mv(guess.slopes, end_velocities))
+        momenta = guess.impulses + mv(guess.slopes, end_velocities)
+        return self.ends.inertia_at_links(guess.slopes), self.ends.momenta_at_links(momenta)
 
     def newton(self, body: Body, guess: GroundMotion) -> GroundMotion:
         """Return the motion under impulses that are linear around a guess."""
@@ -186,10 +186,9 @@ def _solution_jvp(
 ) -> tuple[GroundMotion, GroundMotion]:  # fmt: skip
     """Differentiate the equations that the solution obeys, see `admittance`."""
     problem, guess = primals
-    solution: GroundMotion = solved(jax.lax.stop_gradient(_solution(body, iterations, problem, guess)))
+    solution: GroundMotion = saved(jax.lax.stop_gradient(_solution(body, iterations, problem, guess)))
     active = solution.active
-    ground_inertia, _ = problem.ends.at_links(solution.slopes, solution.impulses)
-    ground_blocks = jax.lax.stop_gradient(packed_inertia(ground_inertia))
+    ground_blocks = jax.lax.stop_gradient(packed_inertia(problem.ends.inertia_at_links(solution.slopes)))
     motion = jnp.concatenate([solution.angular_velocity, solution.velocity], axis=1)[:, :, None]
 
     def equations(problem: GroundProblem) -> LinkEquations:
@@ -199,7 +198,7 @@ def _solution_jvp(
         wrenches = jnp.concatenate(
             [problem.momenta.angular + momenta.angular, problem.momenta.linear + momenta.linear], axis=1
         )
-        servos = combined(_differences(body), problem.impulse)
+        servos = on_links(body, problem.impulse, problem.impulse)
         wrenches = wrenches.at[:, :3].add(servos)[:, :, None] + mm(ground_blocks, motion)
         system = LinkSystem(packed_inertia(problem.inertia) + ground_blocks, problem.anchors, problem.resistance)
         return LinkEquations(system, wrenches, problem.closing[:, :, None])
@@ -213,13 +212,6 @@ def _solution_jvp(
         (tangents[0], *velocity_tangents),
     )
     return solution, solution_tangents
-
-
-def _differences(body: Body) -> np.ndarray:
-    """Return (n, n - 1) 1 where a link is a joint's child, -1 where it is a joint's parent, else 0."""
-    links = np.arange(len(body.links))[:, None]
-    matrix: np.ndarray = (links == np.arange(1, len(body.links))) * 1.0 - (links == body.parents) * 1.0
-    return matrix
 
 
 def ramp(value: Array, width: float) -> Array:

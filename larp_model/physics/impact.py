@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model.linalg import contract, cross, cross_columns, cross_rows, mv, solution
+from larp_model.linalg import contract, cross, cross_columns, cross_rows, mv, saved
 from larp_model.physics import contact
 from larp_model.physics.articulated import Momenta
 from larp_model.physics.collision import (
@@ -81,7 +81,7 @@ def integrate(
     """
     candidates = Candidates(scene)
     count = min(settings.contacts, len(gaps))
-    selection = jax.nn.one_hot(solution(jnp.argsort(gaps, axis=0)[:count]), len(gaps), axis=1, dtype=gaps.dtype)
+    selection = jax.nn.one_hot(saved(jnp.argsort(gaps, axis=0)[:count]), len(gaps), axis=1, dtype=gaps.dtype)
     sides = sides_of(candidates, selection)
     side_gains = {
         name: _side_gains(scene, name, articulation, sides, links.sizes, settings)

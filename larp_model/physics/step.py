@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from larp_model.linalg import rotated, solution
+from larp_model.linalg import rotated, saved
 from larp_model.physics.ball import ball_motion
 from larp_model.physics.collision import Candidates, ContactSettings, Rates
 from larp_model.physics.impact import integrate
@@ -23,11 +23,11 @@ from larp_model.physics.kinematics import Kinematics, kinematics
 from larp_model.physics.motion import Articulation, BodyMotion, Constants, articulated_motion, velocity_products
 from larp_model.scene import Body, Scene
 
-# Number of scenes that are stepped at a time on a CPU: more do not fit into the caches of a core. A GPU takes all at
-# once, which is 13 times faster at 512 of them.
+# Number of scenes with contacts that are stepped at a time on a CPU: more do not fit into the caches of a core. A GPU
+# takes all at once.
 CHUNK = 128
-# What reverse mode keeps of a step: see `linalg.solution`.
-KEPT = jax.checkpoint_policies.save_only_these_names("solution")
+# What reverse mode saves of a step: see `linalg.saved`.
+SAVED = jax.checkpoint_policies.save_only_these_names("saved")
 
 
 class StepInputs(NamedTuple):
@@ -61,8 +61,8 @@ def step(
 class SceneStep:
     """A step of a scene: whole where no links touch each other, else in two halves, each with its contacts.
 
-    Reverse-mode derivatives keep the states before each part and the solutions of its equations, and compute the rest
-    again: what a rollout keeps does not grow with the number of operations in a step.
+    Reverse-mode derivatives save the states before each part and the solutions of its equations, and compute the rest
+    again: what a rollout saves does not grow with the number of operations in a step.
     """
 
     scene: Scene
@@ -77,7 +77,8 @@ class SceneStep:
         """
         count = start.state.shape[-1]
         # The count may be a symbol: see `jax.export`.
-        if not isinstance(count, int) or count <= CHUNK or jax.default_backend() != "cpu":
+        of_one_chunk = not isinstance(count, int) or count <= CHUNK
+        if of_one_chunk or not self.scene.pairs or jax.default_backend() != "cpu":
             return self.chunk(start)
         order = jnp.argsort(self.rough_gaps(jax.lax.stop_gradient(start)))
         chunks = order[np.minimum(np.arange(count + -count % CHUNK), count - 1)].reshape(-1, CHUNK)
@@ -91,8 +92,6 @@ class SceneStep:
     def rough_gaps(self, start: StepInputs) -> Array:
         """Return the smallest gaps (B,) [m] between links within a step at constant velocities."""
         scene, settings = self.scene, replace(self.settings, moments=2)
-        if not scene.pairs:
-            return jnp.zeros(start.state.shape[-1])
         links = kinematics(scene, start.state, start.sizes)
         constant = Rates(*[jnp.zeros_like(links.velocity)] * len(Rates._fields))
         return jnp.min(Candidates(scene).gaps(links, constant, scene.dt, settings), axis=0)
@@ -102,7 +101,7 @@ class SceneStep:
         if not self.scene.pairs:
             return self.part(start, start.state, self.scene.dt, True)[0]
 
-        def part(carry: tuple[Array, Array, Array], whole: Array) -> tuple[tuple[Array, Array, Array], None]:
+        def next_part(carry: tuple[Array, Array, Array], whole: Array) -> tuple[tuple[Array, Array, Array], None]:
             state, after, near = carry
             dt = jnp.where(whole, self.scene.dt, 0.5 * self.scene.dt)
             moved, touching = jax.lax.cond(
@@ -117,7 +116,7 @@ class SceneStep:
         nowhere = jnp.zeros(start.state.shape[-1], bool)
         # One program for the whole step and the two halves: it is compiled once.
         (halves, whole, near), _ = jax.lax.scan(
-            part, (start.state, start.state, nowhere), jnp.array([True, False, False])
+            next_part, (start.state, start.state, nowhere), jnp.array([True, False, False])
         )
         return jnp.where(near, halves, whole)
 
@@ -127,8 +126,8 @@ class SceneStep:
         And where (B,) links touch meanwhile.
         """
 
-        @partial(jax.checkpoint, prevent_cse=False, policy=KEPT)
-        def part(state: Array) -> tuple[Array, Array]:
+        @partial(jax.checkpoint, prevent_cse=False, policy=SAVED)
+        def advanced(state: Array) -> tuple[Array, Array]:
             if not self.scene.pairs:
                 links = kinematics(self.scene, state, start.sizes)
                 return _after(links, self.free_motion(start, links, dt, whole)[0]), jnp.zeros(state.shape[-1], bool)
@@ -137,7 +136,7 @@ class SceneStep:
             total = BodyMotion(*(own + more for own, more in zip(motion, added, strict=True)))
             return _after(links, total), jnp.min(gaps, axis=0) < self.settings.margin
 
-        after: tuple[Array, Array] = part(state)
+        after: tuple[Array, Array] = advanced(state)
         return after
 
     def before_contacts(
@@ -177,7 +176,7 @@ class SceneStep:
     ) -> BodyMotion:  # fmt: skip
         """Return the motion that contacts add, none in a whole step; see `impact.integrate`."""
 
-        @partial(jax.checkpoint, prevent_cse=False, policy=KEPT)
+        @partial(jax.checkpoint, prevent_cse=False, policy=SAVED)
         def contacts(
             links: Kinematics, rates: Rates, articulations: dict[str, Articulation], gaps: Array
         ) -> BodyMotion:
@@ -186,7 +185,7 @@ class SceneStep:
         def none(links: Kinematics, *_: object) -> BodyMotion:
             return BodyMotion(*[jnp.zeros_like(links.velocity)] * len(BodyMotion._fields))
 
-        motion: BodyMotion = solution(jax.lax.cond(whole, none, contacts, links, rates, articulations, gaps))
+        motion: BodyMotion = saved(jax.lax.cond(whole, none, contacts, links, rates, articulations, gaps))
         return motion
 
 

@@ -33,7 +33,7 @@ from tasks.motions.references import embedded
 RUNS = 5
 # Steps before the strike at which a rollout starts.
 BEFORE = 20
-COLUMNS = ("operations", "HLO", "trace [s]", "XLA [s]", "memory [MB]", "run [ms]")
+COLUMNS = ("JAX", "HLO", "trace [s]", "XLA [s]", "[MB]", "run [ms]")
 
 
 class Part(NamedTuple):
@@ -82,19 +82,17 @@ def parts(settings: CompilationSettings) -> dict[str, Part]:
     controls = copies(reference.controls[begin : begin + settings.steps])
     return {
         "kinematics": Part(lambda state: kinematics(scene, state, start.sizes), (start.state,)),
-        "motion of the human": Part(
+        "human": Part(
             lambda links, targets: articulated_motion(
                 human, links, targets, start.torques[scene.rows(human.name)], scene.gravity, dt
             ),
             (links.of(scene, human.name), start.targets),
         ),
-        "motion of the ball": Part(
+        "ball": Part(
             lambda links: ball_motion(ball, links, start.torques[rows], scene.gravity, dt),
             (links.of(scene, ball.name),),
         ),
-        "gaps of links": Part(
-            lambda links, rates: Candidates(scene).gaps(links, rates, dt, ContactSettings()), (links, rates)
-        ),
+        "gaps": Part(lambda links, rates: Candidates(scene).gaps(links, rates, dt, ContactSettings()), (links, rates)),
         "contacts": Part(
             lambda links, rates, articulations: integrate(
                 scene, links, rates, articulations, gaps, dt, ContactSettings()
@@ -102,7 +100,7 @@ def parts(settings: CompilationSettings) -> dict[str, Part]:
             (links, rates, articulations),
         ),
         "step": Part(lambda states, targets: model.step(states, targets), (states, targets)),
-        f"rollout of {settings.steps} steps": Part(
+        f"{settings.steps} steps": Part(
             lambda states, controls: rollout(model.model, model.weights, states, controls, morphology=sizes),
             (copies(reference.states[begin]), controls),
         ),
@@ -149,7 +147,7 @@ def cost(function: Callable[..., Any], inputs: tuple[Any, ...]) -> report.Row:
 
 
 def table(rows: list[report.Row]) -> Table:
-    """Return a table with one row per part, forward and gradient."""
+    """Return a table with one row per part, forward and gradient: operations of JAX and XLA, and the rest of a cost."""
     shown = Table("part", "", *COLUMNS, title="Cost of compiling a step of the kick")
     for row in rows:
         seconds = (f"{row[name]:.2f}" for name in ("trace_s", "xla_s"))
