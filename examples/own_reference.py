@@ -20,7 +20,7 @@ TARGET = (4.0, 0.4, 0.4)
 def leaning(path: Path) -> None:
     """Write the embedded kick as joint angles, with the torso bent by 0.1 rad more."""
     kick = Kick.standard()
-    human, states = kick.scene.bodies[0], kick.reference.states
+    human, states = kick.scene.human, kick.reference.states
     angles = human.angles(states[:, : len(human.links), packed.ORIENTATION])
     angles[:, human.link("torso") - 1, 1] += 0.1
     np.savez(

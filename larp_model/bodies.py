@@ -153,7 +153,7 @@ def human_and_ball(
     self_contact: whether one leg can touch the other, below the knee; else they pass through each other.
     """
     scene = kicking(human(height=height, mass=mass, detail=detail), ball(), dt)
-    return replace(scene, pairs=(*scene.pairs, _legs(scene.bodies[0]))) if self_contact else scene
+    return replace(scene, pairs=(*scene.pairs, _legs(scene.human))) if self_contact else scene
 
 
 def human_and_capsule(height: float = 1.75, mass: float = 70.0, dt: float = 0.01) -> Scene:

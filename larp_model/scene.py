@@ -203,6 +203,19 @@ class Body:
         angles = [(rotations[joint.parent].inv() * rotations[child]).as_rotvec() for child, joint, _ in self.motors]
         return np.stack(angles, axis=1)
 
+    def pose(self, root: np.ndarray, angles: np.ndarray) -> np.ndarray:
+        """Return the orientations (T, n, 4) of the links, w, x, y, z: see `angles`, of which it is the inverse.
+
+        root: orientations (T, 4) of the root. angles: (T, J, 3) [rad]; joints without a motor are in their rest pose.
+        """
+        rotations = [Rotation.from_quat(root, scalar_first=True)]
+        motor_rows = {child: row for row, (child, _, _) in enumerate(self.motors)}
+        for child, joint in enumerate(self.joints, start=1):
+            parent = rotations[joint.parent]
+            row = motor_rows.get(child)
+            rotations.append(parent if row is None else parent * Rotation.from_rotvec(angles[:, row]))
+        return np.stack([rotation.as_quat(scalar_first=True) for rotation in rotations], axis=1)
+
     @property
     def sizes(self) -> np.ndarray:
         """Return length [m], radius [m] and mass [kg] of every link, (n, 3)."""
@@ -294,6 +307,20 @@ class Scene:
                         f"scene.pairs lets {one!r} and {other!r} of {pair.first!r} touch, but they are one link, or "
                         "tied by a joint"
                     )
+
+    @property
+    def human(self) -> Body:
+        """Return the first body, which must have motors."""
+        if not self.bodies[0].motors:
+            raise InputError(f"scene.bodies begin with {self.bodies[0].name!r}, but a human with motors must be first")
+        return self.bodies[0]
+
+    @property
+    def ball(self) -> Body:
+        """Return the last body, which must be one sphere."""
+        if not self.bodies[-1].is_ball:
+            raise InputError(f"scene.bodies end with {self.bodies[-1].name!r}, but a ball must be last")
+        return self.bodies[-1]
 
     def body(self, name: str) -> Body:
         """Return the body of that name."""

@@ -23,7 +23,7 @@ from larp_model.learned.model import Model
 from larp_model.learned.residual import ResidualModel
 from larp_model.networks import Weights
 from larp_model.physics.kinematics import morphology_of
-from larp_model.runtime import remember_compilations
+from larp_model.runtime import prepare_compiler
 from larp_model.scene import Scene
 
 
@@ -74,15 +74,15 @@ class Simulator:
         """Return the simulator of weights by their manifest.
 
         scene: that is to be simulated; what the weights were trained on by default. What is compiled is kept from one
-        process to the next: see `runtime.remember_compilations`.
+        process to the next: see `runtime.prepare_compiler`.
         """
-        remember_compilations()
+        prepare_compiler()
         return Simulator.of(*stored.load(Path(weights), scene)[:2])
 
     @staticmethod
     def of_physics(scene: Scene) -> Simulator:
         """Return the simulator of any scene by physics alone."""
-        remember_compilations()
+        prepare_compiler()
         return Simulator.of(ResidualModel(scene), Weights({}, {}, {}))
 
     def step(

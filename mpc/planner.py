@@ -13,7 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from larp_model.errors import InputError
-from larp_model.runtime import remember_compilations
+from larp_model.runtime import prepare_compiler
 from mpc.cost import CostTerm, require_weight
 from mpc.dynamics import Dynamics
 from mpc.problem import Equations, Inputs, PlannerProblem, Programs
@@ -82,7 +82,7 @@ class Planner:
     `upper` (J, 3) [rad] bound the targets. `dt` [s] is the control step. What the model does is compiled once for each
     set of argument shapes and each number of candidates, and shared with the planners that `using` makes: a moving
     target, weight or reference compiles nothing again, and other processes compile nothing again either: see
-    `runtime.remember_compilations`.
+    `runtime.prepare_compiler`.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class Planner:
         interpolation: Interpolation = "cubic",
         reheat: float = 0.5,
     ) -> None:
-        remember_compilations()
+        prepare_compiler()
         self.dynamics = dynamics
         self.terms = tuple(terms)
         self.horizon = horizon

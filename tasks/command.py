@@ -22,7 +22,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from larp_model.errors import InputError
-from larp_model.runtime import remember_compilations, require_device
+from larp_model.runtime import prepare_compiler, require_device
 from mpc.loop import DivergenceError
 
 # Error numbers of a write to a disk that is full or read-only.
@@ -99,7 +99,7 @@ def _end(code: int, reason: str) -> NoReturn:
 def prepare_jax() -> None:
     """Prepare JAX once arguments are checked: require a device that exists, enable the compilation cache."""
     require_device()
-    remember_compilations()
+    prepare_compiler()
 
 
 class Stream(io.TextIOBase):

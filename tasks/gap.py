@@ -35,7 +35,7 @@ def events(scene: Scene, states: np.ndarray, free: np.ndarray) -> dict[str, Any]
     if not contact:
         return none
     ball = states[:, -1]
-    radius = scene.links[-1].radius
+    radius = scene.ball.links[0].radius
     nearest, normal = _nearest(scene, states[contact - 1])
     launch = ball[min(contact + LAUNCH_STEPS, len(ball) - 1), packed.VELOCITY]
     height = ball[contact:, 2] - radius
@@ -72,7 +72,7 @@ def gap(scene: Scene, truth: np.ndarray, model: np.ndarray, start: int, free: np
         result["launch_angle_deg"] = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
     contact = strike_step(truth, free)
     if contact is not None and 0 <= contact - start < len(model):
-        human = scene.rows(scene.bodies[0].name)
+        human = scene.rows(scene.human.name)
         a, b = truth[contact, human], model[contact - start, human]
         result["links_m"] = float(np.linalg.norm(a[:, :3] - b[:, :3], axis=-1).mean())
         turned = joint_rotations(scene, a).inv() * joint_rotations(scene, b)
@@ -102,7 +102,7 @@ def described(gap: dict[str, Any]) -> dict[str, str]:
 def joint_rotations(scene: Scene, state: np.ndarray) -> Rotation:
     """Return the rotation of each child link of the first body in its parent's frame, from the body's state (n, 13)."""
     turned = Rotation.from_quat(state[:, packed.ORIENTATION], scalar_first=True)
-    joints = scene.bodies[0].joints
+    joints = scene.human.joints
     parents = [joint.parent for joint in joints]
     return turned[parents].inv() * turned[1 : len(joints) + 1]
 

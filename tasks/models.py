@@ -58,7 +58,7 @@ def models_of(
     in a step of MuJoCo. rows: candidates that it rolls out side by side.
     """
     require_known("dynamics", name, get_args(DynamicsName))
-    human, ball = scene.bodies[0].name, scene.bodies[-1].name
+    human, ball = scene.human.name, scene.ball.name
     parts = scene.only(human, ball), scene.only(ball), scene.only(human)
     if name == "mujoco":
         engines = [MujocoDynamics(Truth(part, rows, substeps)) for part in parts]
@@ -74,4 +74,4 @@ def models_of(
 
 def with_flight(scene: Scene, scene_model: Dynamics, ball_model: Dynamics) -> Dynamics:
     """Return dynamics of a scene that follow the ball alone for `FLIGHT` more steps."""
-    return Continued(scene_model, ball_model, slice(scene.rows(scene.bodies[0].name).stop, None), FLIGHT)
+    return Continued(scene_model, ball_model, slice(scene.rows(scene.human.name).stop, None), FLIGHT)

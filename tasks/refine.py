@@ -66,7 +66,7 @@ def outside(value: np.ndarray, lower: float, upper: float) -> np.ndarray:
 
 def costs(scene: Scene, states: np.ndarray) -> dict[str, np.ndarray]:
     """Return the named costs (N,) of kicks (N, T + 1, L, 13)."""
-    human, count = scene.bodies[0], np.arange(len(states))
+    human, count = scene.human, np.arange(len(states))
     foot = human.links[human.link("right_foot")]
     right, left = (states[:, :, human.link(f"{side}_foot")] for side in ("right", "left"))
     pelvis, ball = states[:, :, 0], states[:, :, -1]
@@ -145,7 +145,7 @@ def perform(
     kicks = len(shift)
     states = np.repeat(initial_states(scene, poses), kicks, axis=0)
     states[:, -1, :2] += np.tile(shift, (len(poses), 1))
-    controls = np.stack([key_pose.controls(scene.bodies[0], WATCHED, scene.dt) for key_pose in poses])
+    controls = np.stack([key_pose.controls(scene.human, WATCHED, scene.dt) for key_pose in poses])
     after, finite = truth.rollout(states, (controls[:, None] + noise).reshape(-1, *controls.shape[1:]))
     after[~finite] = states[~finite, None]  # counts as a kick that never happened
     named = costs(scene, np.concatenate([states[:, None], after], axis=1))

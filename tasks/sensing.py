@@ -21,7 +21,7 @@ def noisy(scene: Scene, random: np.random.Generator) -> Callable[[np.ndarray], n
     Joints stay closed, and the position and orientation of the first body's root are exact.
     """
     truth = Truth(scene, threads=1)
-    body, human = scene.bodies[0], scene.rows(scene.bodies[0].name)
+    body, human = scene.human, scene.rows(scene.human.name)
 
     def sense(state: np.ndarray) -> np.ndarray:
         noisy_state: np.ndarray = state.copy()

@@ -58,7 +58,7 @@ class Standing:
 
     def __init__(self, scene: Scene, reference: Reference) -> None:
         self.scene, self.reference = scene, reference
-        human = scene.bodies[0]
+        human = scene.human
         self.human = scene.rows(human.name)
         self.feet = np.array([human.link("left_foot"), human.link("right_foot")])
         self.trunk = np.array([human.link("pelvis"), human.link("torso")])
@@ -137,7 +137,7 @@ def smooth(share: np.ndarray) -> np.ndarray:
 
 def stance(scene: Scene) -> np.ndarray:
     """Return joint targets (J, 3) [rad] of a human who stands with slightly bent knees, feet flat below the hips."""
-    human = scene.bodies[0]
+    human = scene.human
     targets = np.zeros((len(human.motors), 3))
     for row, (child, _, _) in enumerate(human.motors):
         side, _, segment = human.links[child].name.partition("_")

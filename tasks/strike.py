@@ -17,7 +17,7 @@ def untouched(scene: Scene, state: np.ndarray, steps: int, substeps: int = FINE_
 
     substeps: engine steps of the ground truth in a step.
     """
-    truth = Truth(scene.only(scene.bodies[-1].name), 1, substeps, threads=1)
+    truth = Truth(scene.only(scene.ball.name), 1, substeps, threads=1)
     ball = state[None, -1:]
     after, _ = truth.rollout(ball, np.zeros((1, steps, 0, 3)))
     return np.concatenate([ball[0], after[0][:, 0]])

@@ -67,11 +67,11 @@ class Task(ABC):
         scene: its first body is the human, its last the ball. substeps: engine steps of the ground truth in a step.
         """
         self.scene, self.reference, self.substeps = scene, reference, substeps
-        self.human = scene.rows(scene.bodies[0].name)
+        self.human = scene.rows(scene.human.name)
         self.ball = len(scene.links) - 1
-        self.foot = scene.index(scene.bodies[0].name, "right_foot")
+        self.foot = scene.index(scene.human.name, "right_foot")
         self.horizon = reference.strike + BEYOND
-        self.standing_height = standing_height(scene.bodies[0])
+        self.standing_height = standing_height(scene.human)
 
     @classmethod
     def standard(

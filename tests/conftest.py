@@ -16,7 +16,7 @@ from larp_model.learned.model import Model
 from larp_model.learned.paper import PaperModel, Sizes
 from larp_model.learned.residual import ResidualModel
 from larp_model.networks import Size, Weights
-from larp_model.runtime import remember_compilations
+from larp_model.runtime import prepare_compiler
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from larp_model.training import Recipe, Windows, statistics_of
@@ -35,7 +35,7 @@ def a_cache_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Non
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        remember_compilations()
+        prepare_compiler()
         yield
 
 

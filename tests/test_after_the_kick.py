@@ -69,7 +69,7 @@ def test_the_targets_go_from_the_kick_to_the_stance_without_a_jump(task: kick.Ki
 def test_the_capture_point_at_rest_is_below_the_centre_of_mass_and_moves_ahead_with_speed(task: kick.Kick) -> None:
     standing = Standing(task.scene, task.reference)
     human = jnp.asarray(task.reference.states[0, task.human]).at[:, packed.VELOCITY].set(0.0)
-    mass = np.array([link.mass for link in task.scene.bodies[0].links])
+    mass = np.array([link.mass for link in task.scene.human.links])
     centre = mass @ np.asarray(human[:, packed.POSITION]) / mass.sum()
     middle = np.asarray(human[standing.feet, :2]).mean(axis=0)
     np.testing.assert_allclose(standing.capture_point(human), centre[:2] - middle, atol=1e-6)
@@ -128,7 +128,7 @@ def test_sensing_keeps_joints_closed_and_has_the_noise_it_says(task: kick.Kick) 
     assert float(jnp.abs(apart).max()) < 1e-5
     assert np.std(seen[:, task.ball, :3] - state[task.ball, :3]) == pytest.approx(sensing.BALL, rel=0.15)
     np.testing.assert_allclose(seen[:, 0, :7], np.broadcast_to(state[0, :7], (200, 7)), atol=1e-6)
-    child, joint, _ = task.scene.bodies[0].motors[-1]
+    child, joint, _ = task.scene.human.motors[-1]
     true, noisy = (
         Rotation.from_quat(each[..., joint.parent, 3:7], scalar_first=True).inv()
         * Rotation.from_quat(each[..., child, 3:7], scalar_first=True)

@@ -199,7 +199,7 @@ def test_a_sliding_ball_starts_to_roll_as_in_mujoco(bullet: type[BulletTruth]) -
 
 def test_a_servo_pulls_its_joint_to_the_target(bullet: type[BulletTruth]) -> None:
     scene, target = Scene((human(),), gravity=0.0), np.zeros((1, 60, 12, 3))
-    body = scene.bodies[0]
+    body = scene.human
     row = body.link("left_lower_arm")
     target[:, :, row - 1] = 0.2, -1.2, 0.3
     start = standing(scene)

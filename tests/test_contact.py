@@ -260,7 +260,7 @@ def test_a_foot_that_crosses_the_ball_within_a_step_is_seen(scene: Scene) -> Non
     foot, ball = scene.index("human", "right_foot"), scene.index("ball", "ball")
     state = np.zeros((1, len(scene.links), packed.SIZE))
     state[..., packed.ORIENTATION] = 1.0, 0.0, 0.0, 0.0
-    state[0, : len(scene.bodies[0].links), packed.POSITION] = 0.0, 0.0, 5.0
+    state[0, : len(scene.human.links), packed.POSITION] = 0.0, 0.0, 5.0
     state[0, foot, packed.POSITION] = 0.0, -0.2, 0.11  # its axis is x, it moves across
     state[0, ball, packed.POSITION] = 0.0, 0.0, 0.11
     gap = 0.2 - scene.links[foot].radius - scene.links[ball].radius

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from larp_model.runtime import remember_compilations
+from larp_model.runtime import prepare_compiler
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -39,7 +39,7 @@ def test_a_task_from_outside_meets_its_goals(tmp_path: Path, monkeypatch: pytest
 def test_what_an_example_says_of_itself_holds(
     name: str, given: tuple[float, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    remember_compilations()  # they plan with the same planners
+    prepare_compiler()  # they plan with the same planners
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(EXAMPLES)
     runpy.run_path(str(EXAMPLES / f"{name}.py"))["main"](*given)
@@ -54,7 +54,7 @@ def test_kicks_are_shared_among_processes(tmp_path: Path) -> None:
 
 
 def test_the_notebook_runs_and_shows_its_replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    remember_compilations()
+    prepare_compiler()
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
     cells = [cell for cell in json.loads((EXAMPLES / "kick.ipynb").read_text())["cells"] if cell["cell_type"] == "code"]

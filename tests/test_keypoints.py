@@ -135,10 +135,7 @@ class TestFigure:
         pose, proportions = random_pose(random, figure, 4), 0.05 * random.standard_normal(SHARED)
         body = figure.body_of(proportions)
         states = np.zeros((4, len(body.links), 13))
-        turns = [Rotation.from_matrix(pose.turn)]
-        for child, joint in enumerate(body.joints, start=1):
-            turns.append(turns[joint.parent] * Rotation.from_rotvec(pose.angles[:, child - 1]))
-        states[:, :, 3:7] = np.stack([each.as_quat(scalar_first=True) for each in turns], axis=1)
+        states[:, :, 3:7] = body.pose(Rotation.from_matrix(pose.turn).as_quat(scalar_first=True), pose.angles)
         states[:, 0, :3] = pose.place
         seen = physical.BodyPoints(body, figure, proportions).points(closed(Scene((body,)), states).astype(np.float32))
         np.testing.assert_allclose(seen, figure.all_points(pose, proportions), atol=1e-5)

@@ -72,7 +72,7 @@ def test_the_reference_strikes_at_a_kickers_speed_and_is_still_up_half_a_second_
 def test_the_standing_height_is_that_of_the_closed_up_rest_pose() -> None:
     scene = human_and_ball()
     state = references.standing_on_ground(scene, np.zeros((1, len(scene.motors), 3)), Rotation.identity(1))[0]
-    assert state[0, 2] == pytest.approx(standing_height(scene.bodies[0]), abs=1e-9)
+    assert state[0, 2] == pytest.approx(standing_height(scene.human), abs=1e-9)
 
 
 def test_the_full_human_may_touch_the_ball_with_its_toes() -> None:

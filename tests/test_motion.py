@@ -215,7 +215,7 @@ def test_a_chain_comes_to_rest_on_the_ground_and_is_given_no_energy() -> None:
 
 def test_a_standing_human_presses_on_the_ground_as_in_the_truth() -> None:
     scene = human_and_ball().only("human")
-    body, stand = scene.bodies[0], np.zeros((1, len(scene.motors), 3))
+    body, stand = scene.human, np.zeros((1, len(scene.motors), 3))
     states = standing_on_ground(scene, stand, Rotation.identity(1))
     true, _ = Truth(scene).rollout(states, np.zeros((1, 20, len(scene.motors), 3)))
     for _ in range(20):
@@ -326,7 +326,7 @@ def test_a_body_moves_on_the_ground_the_same_whatever_others_need_beside_it() ->
 def test_who_moves_on_the_ground_stays_within_five_millimetres_of_the_truth_for_a_fifth_of_a_second() -> None:
     chosen = scenario("any_human_alone")
     scene, (episodes, _) = chosen.scene, chosen.draw(48, 0)
-    body, sizes = scene.bodies[0], jnp.asarray(episodes.morphology)
+    body, sizes = scene.human, jnp.asarray(episodes.morphology)
 
     def advance(state: Array, control: Array) -> tuple[Array, Array]:
         none = jnp.zeros((*state.shape[:2], 3), state.dtype)

@@ -135,7 +135,7 @@ def test_a_batch_equals_single_runs_bit_for_bit(scene: Scene, reference: Referen
 
 
 def test_targets_and_torques_reach_the_links_they_name(scene: Scene) -> None:
-    human, links = scene.bodies[0], len(scene.links)
+    human, links = scene.human, len(scene.links)
     floating = np.zeros((links, packed.SIZE))
     floating[:, packed.POSITION], floating[:, 3] = (0.0, 0.0, 5.0), 1.0
     truth = Truth(scene, batch=12)

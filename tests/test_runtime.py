@@ -14,7 +14,8 @@ import pytest
 from jax._src.compilation_cache import compress_executable
 from jax.experimental.compilation_cache import compilation_cache
 
-from larp_model.runtime import discard_unreadable, remember_compilations
+from larp_model import runtime
+from larp_model.runtime import discard_unreadable, prepare_compiler
 
 FOLDER = "jax_compilation_cache_dir"
 
@@ -42,13 +43,34 @@ def test_a_device_that_is_missing_is_named_in_one_line() -> None:
     assert ended.stderr.startswith("error: JAX_PLATFORMS is 'cuda', but")
 
 
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ("", "--xla_cpu_use_fusion_emitters=false"),
+        ("--xla_dump_to=here", "--xla_dump_to=here --xla_cpu_use_fusion_emitters=false"),
+        ("--xla_cpu_use_fusion_emitters=true", "--xla_cpu_use_fusion_emitters=true"),
+    ],
+)
+def test_flags_of_the_user_stay(flags: str, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    prepare_compiler()
+    assert os.environ["XLA_FLAGS"] == expected
+
+
+def test_a_version_of_xla_that_may_not_know_the_flag_does_not_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.setattr(runtime, "version", lambda name: "0.11.0")
+    prepare_compiler()
+    assert os.environ["XLA_FLAGS"] == ""
+
+
 def test_without_a_home_nothing_is_remembered_and_nothing_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     def nobody() -> Path:
         raise RuntimeError("Could not determine home directory.")
 
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setattr(Path, "home", nobody)
-    remember_compilations()
+    prepare_compiler()
     assert folder() is None
 
 
@@ -57,13 +79,13 @@ def test_where_the_cache_folder_cannot_be_made_nothing_is_remembered(
 ) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    remember_compilations()
+    prepare_compiler()
     assert folder() is None
 
 
 def test_a_cache_folder_that_the_user_has_set_stays(tmp_path: Path) -> None:
     jax.config.update(FOLDER, str(tmp_path))
-    remember_compilations()
+    prepare_compiler()
     assert folder() == str(tmp_path)
 
 
@@ -87,7 +109,7 @@ def test_a_damaged_cache_is_rewritten_once(tmp_path: Path, monkeypatch: pytest.M
         """Names and sizes of what is remembered after another process has compiled one program."""
         jax.config.update(FOLDER, None)
         compilation_cache.reset_cache()
-        remember_compilations()
+        prepare_compiler()
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.clear_caches()
         jax.jit(lambda x: jnp.sin(x) @ x.T + 41.0)(jnp.ones((3, 3))).block_until_ready()

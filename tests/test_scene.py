@@ -256,11 +256,31 @@ def test_a_ball_is_the_only_body_without_a_direction() -> None:
     assert ball().is_ball and not capsule().is_ball and not chain(links=1).is_ball and not human().is_ball
 
 
-def test_angles_are_those_by_which_children_are_turned_in_their_parents() -> None:
+def test_the_pose_of_angles_has_these_angles() -> None:
     body, random = human(), np.random.default_rng(0)
     angles = random.uniform(-1.0, 1.0, (5, len(body.motors), 3))
-    rotations = [Rotation.random(5, rng=random)]
-    for (_, joint, _), turn in zip(body.motors, np.moveaxis(angles, 1, 0), strict=True):
-        rotations.append(rotations[joint.parent] * Rotation.from_rotvec(turn))
-    orientations = np.stack([rotation.as_quat(scalar_first=True) for rotation in rotations], axis=1)
+    root = Rotation.random(5, rng=random).as_quat(scalar_first=True)
+    orientations = body.pose(root, angles)
+    np.testing.assert_allclose(orientations[:, 0], root, atol=1e-12)
     np.testing.assert_allclose(body.angles(orientations), angles, atol=1e-12)
+
+
+def test_a_pose_turns_children_with_their_parents() -> None:
+    body = human()
+    angles, no_turn = np.zeros((1, len(body.motors), 3)), np.array([[1.0, 0.0, 0.0, 0.0]])
+    torso = [child for child, _, _ in body.motors].index(body.link("torso"))
+    angles[0, torso] = 0.3, -0.2, 0.5
+    orientations, turn = body.pose(no_turn, angles)[0], Rotation.from_rotvec(angles[0, torso])
+    for name in ("torso", "head", "left_upper_arm"):
+        turned = Rotation.from_quat(orientations[body.link(name)], scalar_first=True)
+        np.testing.assert_allclose(turned.as_matrix(), turn.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(orientations[body.link("left_foot")], no_turn[0], atol=1e-12)
+
+
+def test_the_human_of_a_scene_is_first_and_its_ball_last() -> None:
+    scene = human_and_ball()
+    assert (scene.human.name, scene.ball.name) == ("human", "ball")
+    with pytest.raises(InputError, match=r"begin with 'ball'.*human with motors"):
+        _ = scene.only("ball").human
+    with pytest.raises(InputError, match=r"end with 'human'.*ball"):
+        _ = scene.only("human").ball

@@ -121,14 +121,14 @@ def refusal(stored: Path, scene: Scene) -> str:
 def other_human(**changes: Any) -> Scene:
     """The kick's scene with another human."""
     scene = human_and_ball()
-    return replace(scene, bodies=(replace(scene.bodies[0], **changes), scene.bodies[1]))
+    return replace(scene, bodies=(replace(scene.human, **changes), scene.bodies[1]))
 
 
 def other_ball(radius: float) -> Scene:
     """The kick's scene with another ball."""
     scene = human_and_ball()
     own = scene.bodies[1]
-    return replace(scene, bodies=(scene.bodies[0], replace(own, links=(replace(own.links[0], radius=radius),))))
+    return replace(scene, bodies=(scene.human, replace(own, links=(replace(own.links[0], radius=radius),))))
 
 
 HUMAN: Body = human_and_ball().bodies[0]

@@ -71,7 +71,7 @@ def parts(settings: CompilationSettings) -> dict[str, Part]:
         *(jnp.moveaxis(array, 0, -1) for array in (states, targets, jnp.zeros((*states.shape[:2], 3)), sizes))
     )
     one = SceneStep(scene, Constants(), ContactSettings(), lambda body, links, motion, dt: motion)
-    human, ball = scene.bodies[0], scene.bodies[-1]
+    human, ball = scene.human, scene.ball
     rows, dt = scene.rows(ball.name), 0.5 * scene.dt
 
     @jax.jit

@@ -106,7 +106,7 @@ def of_steps(bench: Bench, count: int, seed: int) -> list[Row]:
 
 def ball_slopes(bench: Bench) -> list[Row]:
     """Return rows of a step's derivative by the ball's height, the source of the growth of gradients."""
-    ball, radius = bench.kick.scene.bodies[-1].name, bench.kick.scene.links[-1].radius
+    ball, radius = bench.kick.scene.ball.name, bench.kick.scene.ball.links[0].radius
     model = Simulator.of(bench.model.model.on(bench.kick.scene.only(ball)), bench.model.weights)
     slope = jax.jit(jax.vmap(jax.jacfwd(lambda s: model.step(s[None], jnp.zeros((1, 0, 3)))[0, 0])))
     rows = []

@@ -81,7 +81,7 @@ def _kick(name: str, body: Body, angles: np.ndarray, toe: np.ndarray, strike: in
 
 def performed(name: str, scene: Scene, reference: Reference) -> ReferenceKick:
     """Return a reference's kick from its ground-truth states; the toe is the front end of the foot's axis."""
-    human = scene.bodies[0]
+    human = scene.human
     states = reference.states[:, scene.rows(human.name)]
     angles = human.angles(states[..., packed.ORIENTATION])
     row = human.link("right_foot")
@@ -102,11 +102,11 @@ def recorded(path: Path, scene: Scene) -> ReferenceKick:
         motion = skeleton.mirrored(motion)
     strike = skeleton.strike(motion)
     clip = motion.cut(strike - round((BEFORE + 0.1) * motion.rate), strike + round((AFTER + 0.1) * motion.rate))
-    _, angles = skeleton.retarget(clip, scene.bodies[0], scene.dt)
+    _, angles = skeleton.retarget(clip, scene.human, scene.dt)
     times = np.arange(len(angles)) * scene.dt
     speed = skeleton.toe_speed(clip)
     toe = np.interp(times, np.arange(len(speed)) / clip.rate, speed)
-    return _kick(path.stem, scene.bodies[0], angles, toe, round(skeleton.strike(clip) / clip.rate / scene.dt), scene.dt)
+    return _kick(path.stem, scene.human, angles, toe, round(skeleton.strike(clip) / clip.rate / scene.dt), scene.dt)
 
 
 def table(kicks: list[ReferenceKick]) -> Table:

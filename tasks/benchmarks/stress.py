@@ -107,7 +107,7 @@ def horizons(bench: Bench) -> list[Row]:
         opened = float(apart[: len(part)].max(initial=0.0))
         promise = f"LARP: joints stay closed within {100 * CLOSED:g} cm, or until flagged"
         rows.append(row("horizon", f"{steps} steps", promise, f"{100 * opened:.2g} cm", opened <= CLOSED))
-        sunk = float(np.abs(part[-1, -1, 2] - scene.links[-1].radius))
+        sunk = float(np.abs(part[-1, -1, 2] - scene.ball.links[0].radius))
         promise = "LARP: the ball lies on the ground within 1 cm at the end, or when flagged"
         if steps >= 1_000:
             rows.append(row("horizon", f"{steps} steps", promise, f"{100 * sunk:.2g} cm", sunk <= 0.01))

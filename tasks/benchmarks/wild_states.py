@@ -46,7 +46,7 @@ def scaled(scene: Scene, name: str, field: str, factor: float) -> Scene:
 def standing(scene: Scene, state: np.ndarray) -> np.ndarray:
     """Return a state (L, 13) with joints closed for this scene, the human's lowest link and the ball on the ground."""
     state = state.copy()
-    radius = scene.links[-1].radius
+    radius = scene.ball.links[0].radius
     state[-1, 0] += max(radius - 0.11, 0.0)
     truth = Truth(scene, 1, threads=1)
     truth.reset(state[None])
@@ -111,7 +111,7 @@ class StressCase(NamedTuple):
 
 def keeps_energy(scene: Scene) -> Law:
     """Return the law that the last body, a ball that touches only the ground, gains no energy from its start on."""
-    mass, radius = scene.links[-1].mass, scene.links[-1].radius
+    mass, radius = scene.ball.links[0].mass, scene.ball.links[0].radius
 
     def energy(states: np.ndarray) -> np.ndarray:
         moving = (states[..., -1, packed.VELOCITY] ** 2).sum(-1) + 0.4 * radius**2 * (
@@ -217,14 +217,14 @@ def _overlaps(start: Start) -> Iterator[StressCase]:
     for name, link in (("foot", foot), ("pelvis", 0)):
         yield start.case(f"ball inside the {name}", "centres coincide", partial(_ball_to, link))
     for depth in (0.05, 0.11, 0.5):
-        lowered = _put(-1, 2, kick.scene.links[-1].radius - depth)
+        lowered = _put(-1, 2, kick.scene.ball.links[0].radius - depth)
         yield start.case("ball inside the ground", f"{100 * depth:g} cm", lowered)
     for depth in (0.05, 0.2, 1.0):
         yield start.case("human inside the ground", f"{100 * depth:g} cm", partial(_lift, -depth))
 
 
 def _into_foot(kick: Kick, depth: float) -> Change:
-    reach = kick.scene.links[kick.foot].radius + kick.scene.links[-1].radius - depth
+    reach = kick.scene.links[kick.foot].radius + kick.scene.ball.links[0].radius - depth
     return lambda state: state[-1].__setitem__(packed.POSITION, state[kick.foot, :3] + (0.0, -reach, 0.0))
 
 

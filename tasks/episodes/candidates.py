@@ -46,7 +46,7 @@ def candidate_episodes(kick: Kick, kicks: int, per_plan: int, seed: int, seconds
     """
     random, start_time = np.random.default_rng(seed), time.perf_counter()
     recording = RecordingTruth(Truth(kick.scene, ROWS, SUBSTEPS))
-    ball = MujocoDynamics(Truth(kick.scene.only(kick.scene.bodies[-1].name), ROWS, SUBSTEPS))
+    ball = MujocoDynamics(Truth(kick.scene.only(kick.scene.ball.name), ROWS, SUBSTEPS))
     planner = kick.planner(with_flight(kick.scene, MujocoDynamics(recording), ball), (OPTIMIZER,))
     chosen = []
     for index in range(kicks):

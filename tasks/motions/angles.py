@@ -89,7 +89,8 @@ def motion(
         if sorted(joints) != sorted(names):
             raise InputError(f"joints are {', '.join(joints)}, but must be {', '.join(names)}, in any order")
         angles = angles[:, [joints.index(name) for name in names]]
-    return _motion_of_links(body, float(rate), position, _link_rotations(body, orientation, angles))
+    rotations = Rotation.from_quat(body.pose(orientation, angles).swapaxes(0, 1), scalar_first=True)
+    return _motion_of_links(body, float(rate), position, rotations)
 
 
 def _joint_anchor(body: Body, point: Vector, link: int) -> np.ndarray:
@@ -98,16 +99,7 @@ def _joint_anchor(body: Body, point: Vector, link: int) -> np.ndarray:
     return anchor(point, np.array(length), np.array(radius), body.links[link].axis)
 
 
-def _link_rotations(body: Body, orientation: np.ndarray, angles: np.ndarray) -> list[Rotation]:
-    """Return the world orientations of the links in all frames."""
-    motor_rows = {child: row for row, (child, _, _) in enumerate(body.motors)}
-    rotations = [Rotation.from_quat(orientation, scalar_first=True)]
-    for child, joint in enumerate(body.joints, start=1):
-        rotations.append(rotations[joint.parent] * Rotation.from_rotvec(angles[:, motor_rows[child]]))
-    return rotations
-
-
-def _motion_of_links(body: Body, rate: float, position: np.ndarray, rotations: list[Rotation]) -> Motion:
+def _motion_of_links(body: Body, rate: float, position: np.ndarray, rotations: Rotation) -> Motion:
     """Return the motion with joints at the human's, their frames parallel to the world's in a T-pose."""
     joints = _child_joints(body)
     positions, offsets = [position], [np.zeros(3)]

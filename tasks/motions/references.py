@@ -61,16 +61,10 @@ def standing_on_ground(
 
     root: N orientations of the pelvis, which is above the origin. morphology: (N, L, 3); the scene's by default.
     """
-    human, count = scene.bodies[0], len(targets)
+    human, count = scene.human, len(targets)
     states = np.zeros((count, len(scene.links), packed.SIZE))
     states[..., packed.ORIENTATION] = (1.0, 0.0, 0.0, 0.0)
-    motors = {child: index for index, (child, _, _) in enumerate(human.motors)}
-    rotations = [root]
-    for child, joint in enumerate(human.joints, start=1):
-        rotation_vector = targets[:, motors[child]] if child in motors else np.zeros((count, 3))
-        rotations.append(rotations[joint.parent] * Rotation.from_rotvec(rotation_vector))
-    for row, rotation in enumerate(rotations):
-        states[:, row, packed.ORIENTATION] = rotation.as_quat(scalar_first=True)
+    states[:, : len(human.links), packed.ORIENTATION] = human.pose(root.as_quat(scalar_first=True), targets)
     usual = human.sizes if morphology is None else morphology[:, : len(human.links)]
     sizes = np.broadcast_to(usual, (count, len(human.links), 3))
     closed_states = closed(scene.only(human.name), states[:, : len(human.links)], sizes)
@@ -101,7 +95,7 @@ def resting_height(link: Link, states: np.ndarray, sizes: np.ndarray | None = No
 
 def initial_states(scene: Scene, poses: Sequence[KeyPoses]) -> np.ndarray:
     """Return initial states (N, L, 13) of kicks of key poses; the ball's distance scales with the human's height."""
-    human, ball = scene.bodies[0], scene.bodies[-1]
+    human, ball = scene.human, scene.ball
     height_ratio = standing_height(human) / standing_height(bodies.human(detail=bodies.detail_of(human)))
     first = np.concatenate([pose.controls(human, 1, scene.dt) for pose in poses])
     states = standing_on_ground(scene, first, Rotation.from_euler("xy", [pose.lean for pose in poses]))
@@ -116,7 +110,7 @@ def embedded(scene: Scene, steps: int = 300, poses: KeyPoses | None = None) -> R
     The human is the scene's first body, the ball its last.
     """
     poses = key_poses.load() if poses is None else poses
-    controls, state = poses.controls(scene.bodies[0], steps, scene.dt), initial_states(scene, [poses])[0]
+    controls, state = poses.controls(scene.human, steps, scene.dt), initial_states(scene, [poses])[0]
     truth = Truth(scene)
     next_states, is_finite = truth.rollout(state[None], controls[None])
     if not is_finite[0]:
@@ -213,7 +207,7 @@ def _launched_along_x(states: np.ndarray, strike: int) -> np.ndarray:
 
 def _retargeted(scene: Scene, clip: Motion) -> tuple[np.ndarray, np.ndarray]:
     """Return the clip as states (T, L, 13) and joint targets (T, J, 3) [rad] of the human, the ball out of reach."""
-    human, ball = scene.bodies[0], scene.bodies[-1]
+    human, ball = scene.human, scene.ball
     orientations, default_targets = skeleton.retarget(clip, bodies.human(), scene.dt)
     targets = in_detail(human, default_targets)
     root = Rotation.from_quat(orientations, scalar_first=True)
@@ -251,7 +245,7 @@ def with_servo_lead(scene: Scene, angles: np.ndarray) -> np.ndarray:
 
 def _position_weights(scene: Scene, steps: int, strike: int) -> np.ndarray:
     """Return position weights (T, L) of links: higher for pelvis and feet, highest for the kicking foot at strike."""
-    human = scene.bodies[0]
+    human = scene.human
     pelvis, left, right = (scene.index(human.name, link) for link in ("pelvis", "left_foot", "right_foot"))
     weights = np.zeros((steps, len(scene.links)))
     weights[:, scene.rows(human.name)] = 1.0
@@ -262,7 +256,7 @@ def _position_weights(scene: Scene, steps: int, strike: int) -> np.ndarray:
 
 def _ball_spot(path: str | Path, scene: Scene, states: np.ndarray, strike: int) -> tuple[np.ndarray, int]:
     """Return the ball's position (3,) [m] just ahead of the right foot, and the step near the strike of the touch."""
-    human, radius = scene.bodies[0], scene.bodies[-1].links[0].radius
+    human, radius = scene.human, scene.ball.links[0].radius
     foot = human.links[human.link("right_foot")]
     foot_states = states[:, scene.index(human.name, "right_foot")]
     height = foot_states[:, 2] - radius

@@ -87,18 +87,14 @@ class FilmedMotion(NamedTuple):
 
 def filmed_motion(scene: Scene, figure: Figure, lifted: Lifted, keypoints: Keypoints) -> FilmedMotion:
     """Return the kinematic start and the keypoints, resampled to the steps of the scene."""
-    human = scene.bodies[0]
+    human = scene.human
     frame_times, rate = keypoints.times, keypoints.rate
     times = np.arange(int(frame_times[-1] / scene.dt + 1e-6) + 1) * scene.dt
     place = interpolated(lifted.pose.place, rate, times)
     root = Slerp(frame_times, Rotation.from_matrix(lifted.pose.turn))(times)
     angles = np.clip(interpolated(lifted.pose.angles, rate, times), figure.lower, figure.upper)
     states = np.zeros((len(times), len(human.links), packed.SIZE))
-    rotations = [root]
-    for child, joint in enumerate(human.joints, start=1):
-        rotations.append(rotations[joint.parent] * Rotation.from_rotvec(angles[:, child - 1]))
-    for row, rotation in enumerate(rotations):
-        states[:, row, packed.ORIENTATION] = rotation.as_quat(scalar_first=True)
+    states[..., packed.ORIENTATION] = human.pose(root.as_quat(scalar_first=True), angles)
     states[:, 0, packed.POSITION] = place
     states[:, 0, packed.VELOCITY] = np.gradient(place, scene.dt, axis=0)
     states = closed(scene, with_angular_velocities(states, scene.dt))
@@ -205,7 +201,7 @@ def planner_of(
 
 def initial_state(scene: Scene, filmed: FilmedMotion) -> np.ndarray:
     """Return the initial state (L, 13) of the execution: the kinematic start's, raised out of the ground if needed."""
-    human = scene.bodies[0]
+    human = scene.human
     state: np.ndarray = filmed.states[0].copy()
     height = clearance(human, state[None], human.sizes[None])[0]
     state[:, 2] -= min(height, 0.0)
