@@ -7,14 +7,12 @@ from typing import ClassVar, Literal, NamedTuple
 import numpy as np
 
 from larp_model.errors import InputError
+from mpc.damping import next_damping
 from mpc.search import COLOUR, Evaluations, Problem, Residuals, Search, coloured_noise, merged
 
 # Dampings of a round, evaluated side by side, as multiples of the last best one, which is expected to be best again.
 FACTORS = np.array([1e-2, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0, 1000.0])
 EXPECTED = 3
-# A step that gains more, or less, of what its quadratic promises divides, or multiplies, the next damping, down to a
-# floor; where no step gains anything it is ten times as large.
-GOOD_SHARE, BAD_SHARE, DAMPING_FACTOR, FAILURE_FACTOR, LEAST_DAMPING = 0.75, 0.25, 3.0, 10.0, 1e-6
 # No step is longer, in spreads (root mean square over the knots).
 LONGEST_STEP = 3.0
 
@@ -123,15 +121,11 @@ class GaussNewton:
             if (failed or gain > 0.0) and np.isfinite(expected.costs[0]):
                 linearization = Linearization(centre, expected, directions, neighbour_results)
             failed = not gain > 0.0
-            if failed:
-                damping *= FAILURE_FACTOR
-            else:
+            damping = next_damping(
+                damping if failed else float(dampings[cheapest]), gain, model.gain(coordinates[cheapest])
+            )
+            if not failed:
                 knots, results = knots + steps[cheapest], evaluations.row(cheapest)
-                predicted_gain = model.gain(coordinates[cheapest])
-                damping = dampings[cheapest] * (DAMPING_FACTOR if gain < BAD_SHARE * predicted_gain else 1.0)
-                damping = (
-                    max(damping / DAMPING_FACTOR, LEAST_DAMPING) if gain > GOOD_SHARE * predicted_gain else damping
-                )
             if self.differentiates:
                 linearization = Linearization(knots, results, directions, neighbour_results)
         return search

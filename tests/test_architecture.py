@@ -60,6 +60,7 @@ ORDER = [
     "mpc.spline",
     "mpc.cost",
     "mpc.search",
+    "mpc.damping",
     "mpc.cem",
     "mpc.mppi",
     "mpc.gradient",

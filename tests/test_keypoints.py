@@ -202,6 +202,8 @@ class TestEquations:
         own, common = band.solve(0.1)
         expected = -np.linalg.solve(whole + 0.1 * np.diag(np.diag(whole)), slope)
         np.testing.assert_allclose(np.concatenate([own.ravel(), common]), expected, rtol=1e-3, atol=1e-5)
+        gain = -2.0 * slope @ expected - expected @ whole @ expected
+        assert band.gain(own, common, 0.1) == pytest.approx(gain, rel=1e-3)
 
 
 class TestFilms:

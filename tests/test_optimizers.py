@@ -1,5 +1,6 @@
 """Laws of the optimisers: sampling, gradients, Gauss-Newton and its fallback."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +23,7 @@ from mpc import (
     evaluate,
     interpolate,
 )
+from mpc.damping import next_damping
 from mpc.gauss_newton import Linearization
 from mpc.search import Evaluations, Search, coloured_noise, distinct
 
@@ -146,6 +148,15 @@ def test_one_step_of_gauss_newton_solves_what_is_linear(jacobian: str) -> None:
     _, plan, info = _line(rounds=1, directions=12, jacobian=jacobian, damping=1e-3)
     assert info.cost < 1e-5 * TARGET @ TARGET
     assert np.abs(plan.knots).max() < 1.0
+
+
+def test_damping_falls_where_the_quadratic_is_right_and_rises_where_it_is_wrong() -> None:
+    assert next_damping(0.3, gain=1.0, predicted_gain=1.0) == pytest.approx(0.1)
+    assert next_damping(0.3, gain=0.5, predicted_gain=1.0) == 0.3
+    assert next_damping(0.3, gain=0.1, predicted_gain=1.0) == pytest.approx(0.9)
+    assert next_damping(0.3, gain=0.0, predicted_gain=1.0) == next_damping(0.3, -5.0, 1.0) == pytest.approx(3.0)
+    assert next_damping(0.3, gain=math.nan, predicted_gain=1.0) == pytest.approx(3.0)
+    assert next_damping(1e-6, gain=1.0, predicted_gain=1.0) == 1e-6
 
 
 @pytest.mark.parametrize("rounds", [1, 3])

@@ -45,6 +45,7 @@ class Banded:
     def solve(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the step of frames (F, D) and shared unknowns (S,); damping: share added to the matrix's diagonal."""
         _, frames, size, _ = self.blocks.shape
+        added, added_to_corner = self._added(damping)
         band = np.zeros((3 * size, frames * size))
         row, column = np.indices((size, size))
         for offset in range(3):
@@ -54,8 +55,8 @@ class Banded:
             band[np.broadcast_to(below[in_band], columns.shape), columns] = self.blocks[offset][
                 :, row[in_band], column[in_band]
             ]
-        band[0] += damping * band[0] + 1e-6
-        corner = self.corner + np.diag(damping * np.diag(self.corner) + 1e-9)
+        band[0] += added.ravel()
+        corner = self.corner + np.diag(added_to_corner)
         border = self.border.reshape(frames * size, -1)
         with threadpool_limits(1):  # a band's blocks are so small that several threads take ten times as long
             factor = cholesky_banded(band, lower=True, check_finite=False), True
@@ -64,3 +65,14 @@ class Banded:
             )
         shared = np.linalg.solve(corner - border.T @ eliminated[:, 1:], self.gradient[1] - border.T @ eliminated[:, 0])
         return -(eliminated[:, 0] - eliminated[:, 1:] @ shared).reshape(frames, size), -shared
+
+    def gain(self, step: np.ndarray, shared_step: np.ndarray, damping: float) -> float:
+        """Return by how much the quadratic model expects the step of `solve` to lower the sum of weighted squares."""
+        added, added_to_corner = self._added(damping)
+        along_gradient = np.sum(self.gradient[0] * step) + self.gradient[1] @ shared_step
+        return float(np.sum(added * step**2) + added_to_corner @ shared_step**2 - along_gradient)
+
+    def _added(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return what is added to the diagonal, of frames (F, D) and of shared unknowns (S,)."""
+        diagonal = np.diagonal(self.blocks[0], axis1=1, axis2=2)
+        return damping * diagonal + 1e-6, damping * np.diag(self.corner) + 1e-9

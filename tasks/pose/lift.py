@@ -27,6 +27,7 @@ import numpy as np
 from jax import Array
 from scipy.spatial.transform import Rotation
 
+from mpc.damping import next_damping
 from tasks.pose.banded import Banded
 from tasks.pose.camera import Camera
 from tasks.pose.figure import SHARED, SOLE_HEIGHT, USUAL_HEIGHT, Figure, Pose, figure
@@ -152,18 +153,18 @@ class _FilmFit:
                     return squares + float(deviation @ self.prior @ deviation)
 
                 current = self.quantities(pose, shared)
+                current_cost = cost(current, shared)
                 for weights, residual, derivatives in terms:
                     normal_equations.add(weights, residual(current), derivatives)
                 normal_equations.add_prior(self.prior, shared - self.usual)
                 for _ in range(8):
                     step, shared_step = normal_equations.solve(damping)
-                    next_pose = _stepped(pose, step)
-                    if cost(self.quantities(next_pose, shared + shared_step), shared + shared_step) < cost(
-                        current, shared
-                    ):
-                        pose, shared, damping = next_pose, shared + shared_step, max(0.3 * damping, 1e-6)
+                    next_pose, next_shared = _stepped(pose, step), shared + shared_step
+                    gain = current_cost - cost(self.quantities(next_pose, next_shared), next_shared)
+                    damping = next_damping(damping, gain, normal_equations.gain(step, shared_step, damping))
+                    if gain > 0.0:
+                        pose, shared = next_pose, next_shared
                         break
-                    damping *= 5.0
                 else:
                     break  # no step lowers the cost any more
         return pose, shared
