@@ -88,13 +88,13 @@ def case(request: pytest.FixtureRequest, episodes: Episodes, chains: Episodes) -
 def moved_apart(case: Case) -> np.ndarray:
     """The states with the last body carried far away."""
     states = case.states.copy()
-    states[:, case.model.scene.rows(case.model.scene.ball.name), :2] += 40.0
+    states[:, case.model.scene.rows(case.model.scene.bodies[-1].name), :2] += 40.0
     return states
 
 
 @pytest.mark.slow
 def test_bodies_that_meet_change_each_other(case: Case) -> None:
-    last = case.model.scene.rows(case.model.scene.ball.name)
+    last = case.model.scene.rows(case.model.scene.bodies[-1].name)
     change = case.after(case.states)[..., packed.VELOCITY] - case.after(moved_apart(case))[..., packed.VELOCITY]
     for rows in (slice(0, last.start), last):
         assert np.abs(change[:, rows]).max() > 1e-4, "without contact there would be little to test"
@@ -103,7 +103,7 @@ def test_bodies_that_meet_change_each_other(case: Case) -> None:
 @pytest.mark.slow
 def test_neither_the_order_of_bodies_nor_one_that_can_touch_nothing_changes_the_others(case: Case) -> None:
     scene = case.model.scene
-    last = scene.ball
+    last = scene.bodies[-1]
     crowded = replace(scene, bodies=(replace(last, name="other"), *scene.bodies[::-1]))
     order = [last, *scene.bodies[::-1]]  # the other one is in the very same place
     rows = np.concatenate([np.arange(len(scene.links))[scene.rows(body.name)] for body in order])
