@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import time
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import jax
+from threadpoolctl import ThreadpoolController
 
 from larp_model.errors import InputError
 
@@ -17,6 +20,9 @@ TOLERANCE = 1_000_000_000
 # XLA's older way to compile fused operations for CPUs: a step compiles in 7 instead of 10 s, and takes 2/3 of the time.
 # A process ends whose XLA does not know a flag, so it is given to the versions that do.
 FUSION_FLAG, FUSION_FLAG_VERSIONS = "xla_cpu_use_fusion_emitters", "0.10."
+# So many of a CPU's cores are devices at most: the batches of a planner do not suffice for more.
+MOST_DEVICES = 8
+DEVICES_FLAG = "xla_force_host_platform_device_count"
 
 
 def require_device() -> None:
@@ -36,13 +42,17 @@ def require_device() -> None:
 def prepare_compiler() -> None:
     """Choose how XLA compiles for CPUs, and remember compiled programs from one process to the next.
 
-    The choice counts from JAX's first computation on, and is XLA_FLAGS, where that does not choose already. Programs
-    are in the user's cache folder. A cache folder that JAX has already (JAX_COMPILATION_CACHE_DIR) stays; without a
-    home, or where its cache folder cannot be written, nothing is remembered.
+    A CPU's cores become devices, which share batches (`sharding`). These choices count from JAX's first computation on;
+    where XLA_FLAGS or `jax_num_cpu_devices` choose already, they stay. Programs are in the user's cache folder. A cache
+    folder that JAX has already (JAX_COMPILATION_CACHE_DIR) stays; without a home, or where its cache folder cannot be
+    written, nothing is remembered.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     if FUSION_FLAG not in flags and version("jaxlib").startswith(FUSION_FLAG_VERSIONS):
         os.environ["XLA_FLAGS"] = f"{flags} --{FUSION_FLAG}=false".strip()
+    if DEVICES_FLAG not in flags and jax.config.jax_num_cpu_devices < 1:  # type: ignore[attr-defined]
+        with suppress(RuntimeError):  # JAX has computed something already
+            jax.config.update("jax_num_cpu_devices", min(MOST_DEVICES, cores()))
     if jax.config.jax_compilation_cache_dir is not None:  # type: ignore[attr-defined]
         return
     try:
@@ -53,6 +63,25 @@ def prepare_compiler() -> None:
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+def cores() -> int:
+    """Return how many processors this process may use, which can be fewer than the machine has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def one_blas_thread() -> AbstractContextManager[Any]:
+    """Return a context in which NumPy's linear algebra takes one thread.
+
+    Several gain nothing on small matrices, and wait for the next one in a loop, on cores that JAX needs.
+    """
+    context: AbstractContextManager[Any] = _thread_pools().limit(limits=1, user_api="blas")
+    return context
+
+
+@functools.cache
+def _thread_pools() -> ThreadpoolController:
+    return ThreadpoolController()
 
 
 def discard_unreadable(folder: Path) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +26,7 @@ from larp_model.networks import Weights
 from larp_model.physics.kinematics import morphology_of
 from larp_model.runtime import prepare_compiler
 from larp_model.scene import Scene
+from larp_model.sharding import shared
 
 
 def step(
@@ -109,7 +111,7 @@ class Simulator:
         start, targets, *_ = arguments
         if start.shape[0] == 0:
             return jnp.zeros((0, targets.shape[1], *start.shape[1:]), start.dtype)
-        states = _rollout(self.model, self.weights, *arguments, steps=steps)
+        states = _rollout(self.model, self.weights, *arguments, steps)
         diverged = jnp.cumsum(~packed.healthy(states), axis=1) > 0
         return jnp.where(diverged[..., None, None], jnp.nan, states)
 
@@ -171,5 +173,20 @@ def rollout(
 
 
 # Compiled once for each shape where they are called by themselves; inlined where JAX traces their caller.
-_step = jax.jit(step, static_argnums=0, inline=True)
-_rollout = jax.jit(rollout, static_argnums=0, inline=True)
+@partial(jax.jit, static_argnums=0, inline=True)
+def _step(model: Model, weights: Weights, *arrays: Any) -> Array:
+    return shared(partial(step, model), *_by_row(weights, *arrays))
+
+
+@partial(jax.jit, static_argnums=0, inline=True)
+def _rollout(model: Model, weights: Weights, *arrays: Any) -> Array:
+    return shared(partial(rollout, model), *_by_row(weights, *arrays))
+
+
+def _by_row(
+    weights: Weights, state: Array, control: Array, torque: Array | None, morphology: Array, *steps: Array | None
+) -> tuple[int, tuple[Any, ...], tuple[bool, ...]]:
+    """Return the other arguments of `sharding.shared` for a step or a rollout."""
+    count = state.shape[0]
+    arguments = (weights, state, control, torque, morphology, *steps)
+    return count, arguments, (False, True, True, True, morphology.shape[0] == count, *(False for _ in steps))

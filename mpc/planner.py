@@ -13,7 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from larp_model.errors import InputError
-from larp_model.runtime import prepare_compiler
+from larp_model.runtime import one_blas_thread, prepare_compiler
 from mpc.cost import CostTerm, require_weight
 from mpc.dynamics import Dynamics
 from mpc.problem import Equations, Inputs, PlannerProblem, Programs
@@ -163,11 +163,12 @@ class Planner:
         random = np.random.default_rng(plan.key)
         search = self._warm_start(plan, window.time - float(plan.start), random)
         problem = PlannerProblem(self._equations, self._programs, inputs, search.elites[0])
-        for optimizer in self.optimizers:
-            search = optimizer.improve(search, random, problem)
-            if len(search.elites) != self.elites:
-                name = type(optimizer).__name__
-                raise InputError(f"optimizers: got {len(search.elites)} elites from {name}, needs {self.elites}")
+        with one_blas_thread():
+            for optimizer in self.optimizers:
+                search = optimizer.improve(search, random, problem)
+                if len(search.elites) != self.elites:
+                    name = type(optimizer).__name__
+                    raise InputError(f"optimizers: got {len(search.elites)} elites from {name}, needs {self.elites}")
         evaluated = np.isfinite(search.costs)[:, None, None, None]
         elites = np.where(evaluated, search.elites, search.elites[0])
         new_plan = Plan(elites, search.spread, np.float32(window.time), _entropy(random))

@@ -121,7 +121,11 @@ class Programs:
     def __call__(self, name: Any, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return the function's finished result, compiled first where needed; `name` stands for the function."""
         leaves, structure = jax.tree.flatten(arguments)
-        signature = name, structure, tuple((np.shape(leaf), leaf.dtype) for leaf in leaves)
+        signature = (
+            name,
+            structure,
+            tuple((np.shape(leaf), leaf.dtype, getattr(leaf, "sharding", None)) for leaf in leaves),
+        )
         if signature not in self._compiled:
             begin = time.perf_counter()
             self._compiled[signature] = jax.jit(function).lower(*arguments).compile()

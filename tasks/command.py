@@ -97,9 +97,9 @@ def _end(code: int, reason: str) -> NoReturn:
 
 
 def prepare_jax() -> None:
-    """Prepare JAX once arguments are checked: require a device that exists, enable the compilation cache."""
+    """Prepare JAX once arguments are checked: choose how it compiles, require a device that exists."""
+    prepare_compiler()  # its choices count only before JAX looks for devices
     require_device()
-    prepare_compiler()
 
 
 class Stream(io.TextIOBase):

@@ -44,6 +44,7 @@ ORDER = [
     "larp_model.learned",
     "larp_model.designs",
     "larp_model.weights",
+    "larp_model.sharding",
     "larp_model.simulator",
     "larp_model.losses",
     "larp_model.training",

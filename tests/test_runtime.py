@@ -64,6 +64,15 @@ def test_a_version_of_xla_that_may_not_know_the_flag_does_not_get_it(monkeypatch
     assert os.environ["XLA_FLAGS"] == ""
 
 
+def test_commands_make_cores_devices_before_they_look_for_one() -> None:
+    program = "from tasks.command import prepare_jax; prepare_jax(); import jax; print(len(jax.devices()))"
+    environment = {
+        name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "JAX_NUM_CPU_DEVICES")
+    }
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment)
+    assert ended.stdout.strip() == str(min(runtime.MOST_DEVICES, runtime.cores()))
+
+
 def test_without_a_home_nothing_is_remembered_and_nothing_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     def nobody() -> Path:
         raise RuntimeError("Could not determine home directory.")

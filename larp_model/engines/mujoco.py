@@ -6,7 +6,6 @@ A step of `scene.dt` takes several engine steps, because the engine's usual step
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import mujoco
@@ -16,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
 from larp_model.errors import InputError
+from larp_model.runtime import cores
 from larp_model.scene import Body, Link, Scene, Surface, anchor
 
 # Halving the engine's step beyond this moves the ball's launch velocity by less than 1 % (median).
@@ -96,11 +96,6 @@ def _add_pair(spec: mujoco.MjSpec, first: str, second: str, surface: Surface) ->
     pair.solref = [-surface.stiffness, -surface.damping]
     pair.solimp = [0.99, 0.99, 0.001, 0.5, 2.0]
     pair.friction[:2] = max(surface.friction, 1e-5)
-
-
-def cores() -> int:
-    """Return how many processors this process may use; the engine's default counts all of the machine's."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class Truth:

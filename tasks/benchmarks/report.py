@@ -18,9 +18,9 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-from larp_model.engines.mujoco import cores
 from larp_model.errors import InputError
 from larp_model.files import require_writable, write_whole, written_whole
+from larp_model.runtime import cores
 
 RESULTS = Path("RESULTS.md")
 # Pictures that the README shows.

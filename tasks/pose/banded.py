@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
-from threadpoolctl import threadpool_limits
+
+from larp_model.runtime import one_blas_thread
 
 
 class Banded:
@@ -58,7 +59,7 @@ class Banded:
         band[0] += added.ravel()
         corner = self.corner + np.diag(added_to_corner)
         border = self.border.reshape(frames * size, -1)
-        with threadpool_limits(1):  # a band's blocks are so small that several threads take ten times as long
+        with one_blas_thread():  # a band's blocks are so small that several threads take ten times as long
             factor = cholesky_banded(band, lower=True, check_finite=False), True
             eliminated = cho_solve_banded(
                 factor, np.column_stack([self.gradient[0].ravel(), border]), check_finite=False
