@@ -22,6 +22,7 @@ from larp_model.bodies import usual
 from larp_model.errors import InputError
 from larp_model.learned.model import Model
 from larp_model.learned.residual import ResidualModel
+from larp_model.linearization import linearized
 from larp_model.networks import Weights
 from larp_model.physics.kinematics import morphology_of
 from larp_model.runtime import prepare_compiler
@@ -115,6 +116,21 @@ class Simulator:
         diverged = jnp.cumsum(~packed.healthy(states), axis=1) > 0
         return jnp.where(diverged[..., None, None], jnp.nan, states)
 
+    def linearize(self, states: ArrayLike, controls: ArrayLike) -> tuple[Array, Array]:
+        """Return A (*, 2 V, 2 V) and B (*, 2 V, 3 J), derivatives of steps from states (*, L, 13).
+
+        controls: (*, J, 3) [rad]. Near them the state after a step changes by A dx + B du, for changes dx of the state
+        in the 2 V coordinates of `linearization`, and du of the controls [rad].
+        """
+        state, control = _array("states", states), _array("controls", controls)
+        lead = state.shape[:-2]
+        if control.shape[:-2] != lead or state.ndim < 2:
+            raise InputError(f"controls have shape {control.shape}, but need {(*lead, len(self.scene.motors), 3)}")
+        flat_state, flat_control = (array.reshape(-1, *array.shape[-2:]) for array in (state, control))
+        start, targets, _, sizes = self._checked(flat_state, flat_control, None, None, ())
+        by_state, by_control = _linearized(self.model, self.weights, start, targets, sizes)
+        return by_state.reshape(*lead, *by_state.shape[1:]), by_control.reshape(*lead, *by_control.shape[1:])
+
     def _checked(
         self, state: ArrayLike, control: ArrayLike, torque: ArrayLike | None, morphology: ArrayLike | None,
         steps: tuple[int, ...],
@@ -181,6 +197,14 @@ def _step(model: Model, weights: Weights, *arrays: Any) -> Array:
 @partial(jax.jit, static_argnums=0, inline=True)
 def _rollout(model: Model, weights: Weights, *arrays: Any) -> Array:
     return shared(partial(rollout, model), *_by_row(weights, *arrays))
+
+
+@partial(jax.jit, static_argnums=0, inline=True)
+def _linearized(model: Model, weights: Weights, state: Array, control: Array, sizes: Array) -> tuple[Array, Array]:
+    def one_step(state: Array, control: Array, sizes: Array) -> Array:
+        return step(model, weights, state, control, morphology=sizes)
+
+    return linearized(model.scene, one_step, state, control, jnp.broadcast_to(sizes, (len(state), *sizes.shape[1:])))
 
 
 def _by_row(

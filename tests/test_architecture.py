@@ -45,6 +45,7 @@ ORDER = [
     "larp_model.designs",
     "larp_model.weights",
     "larp_model.sharding",
+    "larp_model.linearization",
     "larp_model.simulator",
     "larp_model.losses",
     "larp_model.training",

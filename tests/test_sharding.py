@@ -9,20 +9,25 @@ from pathlib import Path
 
 import numpy as np
 
+from larp_model.scene import Body, Joint, Link, Motor
+
+MOTOR = Motor(30.0, 2.0, 20.0, (-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
+LINKS = Link("upper", 0.4, 0.05, 3.0), Link("lower", 0.4, 0.05, 1.0)
+LEG = Body("leg", "leg", LINKS, (Joint(0, (0.0, 0.0, -1.0), (0.0, 0.0, 1.0), MOTOR),))
+"""Two links and a motor."""
+
 PROGRAM = """
 import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from larp_model.scene import Body, Joint, Link, Motor, Scene
+from larp_model.scene import Scene
 from larp_model.simulator import Simulator
+from test_sharding import LEG
 from mpc import CEM, CostTerm, Planner, Window
 
-motor = Motor(30.0, 2.0, 20.0, (-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
-links = Link("upper", 0.4, 0.05, 3.0), Link("lower", 0.4, 0.05, 1.0)
-leg = Body("leg", "leg", links, (Joint(0, (0.0, 0.0, -1.0), (0.0, 0.0, 1.0), motor),))
-simulator = Simulator.of_physics(Scene((leg,)))
+simulator = Simulator.of_physics(Scene((LEG,)))
 start = np.zeros((2, 13), np.float32)
 start[:, 3] = 1.0
 start[:, 2] = 0.75, 0.35
@@ -45,7 +50,12 @@ def test_eight_devices_give_the_rollouts_gradients_and_plans_of_one(tmp_path: Pa
     for count in (1, 8):
         path = tmp_path / f"{count}.npz"
         environment = os.environ | {"JAX_NUM_CPU_DEVICES": str(count)}
-        subprocess.run([sys.executable, "-c", PROGRAM, str(count), str(path)], check=True, env=environment)
+        subprocess.run(
+            [sys.executable, "-c", PROGRAM, str(count), str(path)],
+            check=True,
+            env=environment,
+            cwd=Path(__file__).parent,
+        )
         results.append(np.load(path))
     one, eight = results
     assert np.ptp(one["rollout"][:, -1, 1, 0]) > 0.01, "controls move nothing: there is little to compare"
