@@ -8,7 +8,7 @@ dx are generalised coordinates of a small change of a state, which leave joints 
 each in the world's axes, those of joints of the child relative to its parent. First come the positions of all bodies,
 then all rates: 2 V coordinates, V = sum of 3 (n + 1). du (3 J,) are changes of joint targets [rad].
 
-Arrays have the batch last, as in `linalg`.
+Arrays of `Coordinates` have the batch last, as in `linalg`.
 """
 
 from __future__ import annotations
@@ -25,6 +25,12 @@ from larp_model import state as packed
 from larp_model.linalg import combined, cross, dot
 from larp_model.physics.kinematics import Anchors, kinematics, turned_anchors
 from larp_model.scene import Body, Scene
+
+# States that are linearised at a time: links that touch in one of them cost time in all.
+GROUP = 8
+
+Step = Callable[[Array, Array, Array], Array]
+"""(states (B, L, 13), controls (B, J, 3), sizes (B, L, 3)) -> states (B, L, 13)"""
 
 
 @dataclass(frozen=True)
@@ -96,13 +102,6 @@ def _body_change(body: Body, state: Array, anchors: Anchors, positions: Array, r
     w, v = state[:, 3:4], state[:, 4:7]
     quaternion = 0.5 * jnp.concatenate([-dot(turns, v), w * turns + cross(turns, v)], axis=1)
     return jnp.concatenate([position, quaternion, rate, turn_rates], axis=1)
-
-
-# States that are linearised at a time: links that touch in one of them cost time in all.
-GROUP = 8
-
-Step = Callable[[Array, Array, Array], Array]
-"""(states (B, L, 13), controls (B, J, 3), sizes (B, L, 3)) -> states (B, L, 13)"""
 
 
 def linearized(scene: Scene, step: Step, state: Array, control: Array, sizes: Array) -> tuple[Array, Array]:

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from threadpoolctl import ThreadpoolController
 
 from larp_model.errors import InputError
 
 # Of the file times of an entry and of the stamp [ns]: file systems round them.
 TOLERANCE = 1_000_000_000
-# XLA's older way to compile fused operations for CPUs: a step compiles in 7 instead of 10 s, and takes 2/3 of the time.
+# XLA's older way to compile fused operations for CPUs: a step compiles in less time, and takes less. See
+# `tasks.benchmarks.compilation`.
 # A process ends whose XLA does not know a flag, so it is given to the versions that do.
 FUSION_FLAG, FUSION_FLAG_VERSIONS = "xla_cpu_use_fusion_emitters", "0.10."
 # So many of a CPU's cores are devices at most: the batches of a planner do not suffice for more.
@@ -80,7 +80,9 @@ def one_blas_thread() -> AbstractContextManager[Any]:
 
 
 @functools.cache
-def _thread_pools() -> ThreadpoolController:
+def _thread_pools() -> Any:
+    from threadpoolctl import ThreadpoolController  # its import sets an environment variable
+
     return ThreadpoolController()
 
 

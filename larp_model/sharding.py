@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 
-# Rows of a batch that a device takes at least: fewer take it no less time.
+# Rows of a batch that a device takes at least: fewer are not worth a shared program, which compiles for longer.
 LEAST_ROWS = 4
 
 
@@ -26,7 +26,8 @@ def shared(function: Callable[..., Array], count: int, arguments: tuple[Any, ...
     symbol (`jax.export`) or the user has chosen a device (`jax.default_device`).
     """
     devices = jax.devices()
-    if len(devices) == 1 or not isinstance(count, int) or jax.config.jax_default_device is not None:  # type: ignore[attr-defined]
+    chosen = jax.config.jax_default_device is not None  # type: ignore[attr-defined]
+    if len(devices) == 1 or chosen or not isinstance(count, int):
         return function(*arguments)
     if count % len(devices) or count < LEAST_ROWS * len(devices):
         return function(*arguments)

@@ -124,7 +124,7 @@ class Simulator:
         """
         state, control = _array("states", states), _array("controls", controls)
         lead = state.shape[:-2]
-        if control.shape[:-2] != lead or state.ndim < 2:
+        if control.shape[:-2] != lead:
             raise InputError(f"controls have shape {control.shape}, but need {(*lead, len(self.scene.motors), 3)}")
         flat_state, flat_control = (array.reshape(-1, *array.shape[-2:]) for array in (state, control))
         start, targets, _, sizes = self._checked(flat_state, flat_control, None, None, ())

@@ -1,4 +1,4 @@
-"""Small problems of one link: its motor's target is read as a velocity or an acceleration."""
+"""Small problems of one link, whose motor's target is read as a velocity or an acceleration, and a leg of two."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -7,9 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from larp_model.scene import Body, Joint, Link, Motor
 from mpc import CEM, CostTerm, Planner, Window, quadratic
 
 HORIZON, KNOTS, DT = 12, 4, 0.01
+
+MOTOR = Motor(30.0, 2.0, 20.0, (-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
+LINKS = Link("upper", 0.4, 0.05, 3.0), Link("lower", 0.4, 0.05, 1.0)
+LEG = Body("leg", "leg", LINKS, (Joint(0, (0.0, 0.0, -1.0), (0.0, 0.0, 1.0), MOTOR),))
+"""Two links and a motor."""
 
 
 @dataclass(frozen=True)

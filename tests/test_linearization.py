@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import Array
-from test_sharding import LEG
+from small_problems import LEG
 
 from larp_model.bodies import ball
 from larp_model.errors import InputError

@@ -9,13 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from larp_model.scene import Body, Joint, Link, Motor
-
-MOTOR = Motor(30.0, 2.0, 20.0, (-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
-LINKS = Link("upper", 0.4, 0.05, 3.0), Link("lower", 0.4, 0.05, 1.0)
-LEG = Body("leg", "leg", LINKS, (Joint(0, (0.0, 0.0, -1.0), (0.0, 0.0, 1.0), MOTOR),))
-"""Two links and a motor."""
-
 PROGRAM = """
 import sys
 import jax
@@ -24,7 +17,7 @@ import numpy as np
 
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
-from test_sharding import LEG
+from small_problems import LEG
 from mpc import CEM, CostTerm, Planner, Window
 
 simulator = Simulator.of_physics(Scene((LEG,)))
