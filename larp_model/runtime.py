@@ -16,10 +16,12 @@ from larp_model.errors import InputError
 
 # Of the file times of an entry and of the stamp [ns]: file systems round them.
 TOLERANCE = 1_000_000_000
-# XLA's older way to compile fused operations for CPUs: a step compiles in less time, and takes less. See
-# `tasks.benchmarks.compilation`.
-# A process ends whose XLA does not know a flag, so it is given to the versions that do.
-FUSION_FLAG, FUSION_FLAG_VERSIONS = "xla_cpu_use_fusion_emitters", "0.10."
+# XLA's older way to compile fused operations for CPUs, and loops over the axes of small matrices that LLVM does not
+# unroll: a step compiles in half the time, and takes less. See `tasks.benchmarks.compilation`.
+# A process ends whose XLA does not know a flag, so they are given to the versions in which they were measured.
+COMPILER_FLAGS, MEASURED_VERSIONS = (
+    {"xla_cpu_use_fusion_emitters": "false", "xla_backend_extra_options": "xla_cpu_disable_loop_unrolling"}, "0.10.",
+)  # fmt: skip
 # So many of a CPU's cores are devices at most: the batches of a planner do not suffice for more.
 MOST_DEVICES = 8
 DEVICES_FLAG = "xla_force_host_platform_device_count"
@@ -48,8 +50,10 @@ def prepare_compiler() -> None:
     written, nothing is remembered.
     """
     flags = os.environ.get("XLA_FLAGS", "")
-    if FUSION_FLAG not in flags and version("jaxlib").startswith(FUSION_FLAG_VERSIONS):
-        os.environ["XLA_FLAGS"] = f"{flags} --{FUSION_FLAG}=false".strip()
+    if version("jaxlib").startswith(MEASURED_VERSIONS):
+        chosen = [f"--{name}={value}" for name, value in COMPILER_FLAGS.items() if name not in flags]
+        if chosen:
+            os.environ["XLA_FLAGS"] = " ".join([flags, *chosen]).strip()
     if DEVICES_FLAG not in flags and jax.config.jax_num_cpu_devices < 1:  # type: ignore[attr-defined]
         with suppress(RuntimeError):  # JAX has computed something already
             jax.config.update("jax_num_cpu_devices", min(MOST_DEVICES, cores()))

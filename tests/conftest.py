@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 from collections.abc import Iterator
 
 import jax
@@ -29,14 +30,26 @@ settings.load_profile("repeatable")
 
 
 @pytest.fixture(autouse=True, scope="session")
-def a_cache_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def a_cache_of_this_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Keep compiled programs from one file of tests to the next, as commands keep them from run to run: here
-    not in the user's cache, nor in that of another process.
+    not in the user's cache, but in one that the processes of this run share.
     """
+    workers = "PYTEST_XDIST_WORKER" in os.environ
+    run = tmp_path_factory.getbasetemp().parent if workers else tmp_path_factory.getbasetemp()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("XDG_CACHE_HOME", str(run / "cache"))
         prepare_compiler()
         yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def garbage_is_collected_rarely() -> None:
+    """Tracing makes so many objects that Python, where it has many already, would spend a third of the time on a
+    search for garbage among them.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(100_000, 20, 50)
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -38,8 +38,12 @@ FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-
 FEW = (CEM(samples=8, rounds=1, elites=2),)
 QUICK, OTHER = Preset(FEW, FEW, interval=50, recovery=FEW), Preset(FEW, FEW, interval=25, recovery=FEW)
 TARGET = np.array([3.0, 0.2, 0.4])
-# A browser without a GPU draws so many pixels in time.
+# A browser without a GPU draws so many pixels in time, and so often that the planner has cores left.
 SMALL = (640, 400)
+FEWER_FRAMES = """
+    const draw = window.requestAnimationFrame.bind(window)
+    window.requestAnimationFrame = callback => draw(() => setTimeout(() => callback(performance.now()), 100))
+"""
 
 
 @dataclass
@@ -101,6 +105,7 @@ def give_way() -> None:
 
 def opened(browser: Browser, served: Served, size: tuple[int, int] = SMALL) -> Page:
     seen = browser.new_page(viewport={"width": size[0], "height": size[1]})
+    seen.add_init_script(FEWER_FRAMES)
     before = len(served.page._clients.views)
     seen.goto(served.page.address)
     seen.get_by_text("LARP-MPC").first.wait_for()

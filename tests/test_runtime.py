@@ -18,6 +18,7 @@ from larp_model import runtime
 from larp_model.runtime import discard_unreadable, prepare_compiler
 
 FOLDER = "jax_compilation_cache_dir"
+FUSION, EXTRA = "--xla_cpu_use_fusion_emitters", "--xla_backend_extra_options"
 
 
 @pytest.fixture(autouse=True)
@@ -46,9 +47,10 @@ def test_a_device_that_is_missing_is_named_in_one_line() -> None:
 @pytest.mark.parametrize(
     ("flags", "expected"),
     [
-        ("", "--xla_cpu_use_fusion_emitters=false"),
-        ("--xla_dump_to=here", "--xla_dump_to=here --xla_cpu_use_fusion_emitters=false"),
-        ("--xla_cpu_use_fusion_emitters=true", "--xla_cpu_use_fusion_emitters=true"),
+        ("", f"{FUSION}=false {EXTRA}=xla_cpu_disable_loop_unrolling"),
+        ("--xla_dump_to=here", f"--xla_dump_to=here {FUSION}=false {EXTRA}=xla_cpu_disable_loop_unrolling"),
+        (f"{FUSION}=true", f"{FUSION}=true {EXTRA}=xla_cpu_disable_loop_unrolling"),
+        (f"{FUSION}=true {EXTRA}=a", f"{FUSION}=true {EXTRA}=a"),
     ],
 )
 def test_flags_of_the_user_stay(flags: str, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -57,7 +59,7 @@ def test_flags_of_the_user_stay(flags: str, expected: str, monkeypatch: pytest.M
     assert os.environ["XLA_FLAGS"] == expected
 
 
-def test_a_version_of_xla_that_may_not_know_the_flag_does_not_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_version_of_xla_that_may_not_know_the_flags_does_not_get_them(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XLA_FLAGS", "")
     monkeypatch.setattr(runtime, "version", lambda name: "0.11.0")
     prepare_compiler()
