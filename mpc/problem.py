@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from larp_model.runtime import no_garbage_collection
 from mpc.cost import CostTerm, curvatures, evaluate, residuals, weighted_cost
 from mpc.dynamics import Dynamics, side_by_side
 from mpc.search import Evaluations, Residuals
@@ -128,7 +129,8 @@ class Programs:
         )
         if signature not in self._compiled:
             begin = time.perf_counter()
-            self._compiled[signature] = jax.jit(function).lower(*arguments).compile()
+            with no_garbage_collection():
+                self._compiled[signature] = jax.jit(function).lower(*arguments).compile()
             self.seconds += time.perf_counter() - begin
         return jax.block_until_ready(self._compiled[signature](*arguments))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
@@ -15,7 +16,7 @@ from jax._src.compilation_cache import compress_executable
 from jax.experimental.compilation_cache import compilation_cache
 
 from larp_model import runtime
-from larp_model.runtime import discard_unreadable, prepare_compiler
+from larp_model.runtime import discard_unreadable, no_garbage_collection, prepare_compiler
 
 FOLDER = "jax_compilation_cache_dir"
 FUSION, EXTRA = "--xla_cpu_use_fusion_emitters", "--xla_backend_extra_options"
@@ -73,6 +74,18 @@ def test_commands_make_cores_devices_before_they_look_for_one() -> None:
     }
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment)
     assert ended.stdout.strip() == str(min(runtime.MOST_DEVICES, runtime.cores()))
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_garbage_is_collected_afterwards_as_before_whatever_happens(enabled: bool) -> None:
+    (gc.enable if enabled else gc.disable)()
+    try:
+        with pytest.raises(ValueError, match="in between"), no_garbage_collection():
+            assert not gc.isenabled()
+            raise ValueError("in between")
+        assert gc.isenabled() == enabled
+    finally:
+        gc.enable()
 
 
 def test_without_a_home_nothing_is_remembered_and_nothing_fails(monkeypatch: pytest.MonkeyPatch) -> None:

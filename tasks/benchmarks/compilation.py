@@ -24,6 +24,7 @@ from larp_model.physics.impact import integrate
 from larp_model.physics.kinematics import Kinematics, kinematics
 from larp_model.physics.motion import Articulation, Constants, articulated_motion
 from larp_model.physics.step import SceneStep, StepInputs
+from larp_model.runtime import no_garbage_collection
 from larp_model.simulator import Simulator, rollout
 from tasks.benchmarks import report
 from tasks.command import run
@@ -125,8 +126,9 @@ def operations(jaxpr: Jaxpr) -> int:
 def cost(function: Callable[..., Any], inputs: tuple[Any, ...]) -> report.Row:
     """Return what a function costs to trace, to compile and to run."""
     begin = time.perf_counter()
-    traced = jax.jit(lambda *arguments: function(*arguments)).trace(*inputs)
-    lowered = traced.lower()
+    with no_garbage_collection():  # as the planner does
+        traced = jax.jit(lambda *arguments: function(*arguments)).trace(*inputs)
+        lowered = traced.lower()
     tracing = time.perf_counter() - begin
     compiled = lowered.compile()
     compiling = time.perf_counter() - begin - tracing
