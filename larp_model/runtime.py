@@ -21,9 +21,11 @@ TOLERANCE = 1_000_000_000
 # XLA's older way to compile fused operations for CPUs, and loops over the axes of small matrices that LLVM does not
 # unroll: a step compiles in half the time, and takes less. See `tasks.benchmarks.compilation`.
 # A process ends whose XLA does not know a flag, so they are given to the versions in which they were measured.
-COMPILER_FLAGS, MEASURED_VERSIONS = (
-    {"xla_cpu_use_fusion_emitters": "false", "xla_backend_extra_options": "xla_cpu_disable_loop_unrolling"}, "0.10.",
-)  # fmt: skip
+COMPILER_FLAGS = {
+    "xla_cpu_use_fusion_emitters": "false",
+    "xla_backend_extra_options": "xla_cpu_disable_loop_unrolling",
+}
+MEASURED_VERSIONS = "0.10."
 # So many of a CPU's cores are devices at most: the batches of a planner do not suffice for more.
 MOST_DEVICES = 8
 DEVICES_FLAG = "xla_force_host_platform_device_count"
@@ -87,10 +89,7 @@ def one_blas_thread() -> AbstractContextManager[Any]:
 
 @contextmanager
 def no_garbage_collection() -> Iterator[None]:
-    """Keep Python from looking for garbage meanwhile, as it does again and again among the objects that tracing makes.
-
-    To trace a gradient of a rollout takes half the time then.
-    """
+    """Keep Python from looking for garbage meanwhile, as it would again and again among what tracing makes."""
     enabled = gc.isenabled()
     gc.disable()
     try:

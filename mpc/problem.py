@@ -130,7 +130,8 @@ class Programs:
         if signature not in self._compiled:
             begin = time.perf_counter()
             with no_garbage_collection():
-                self._compiled[signature] = jax.jit(function).lower(*arguments).compile()
+                lowered = jax.jit(function).lower(*arguments)
+            self._compiled[signature] = lowered.compile()
             self.seconds += time.perf_counter() - begin
         return jax.block_until_ready(self._compiled[signature](*arguments))
 

@@ -44,9 +44,7 @@ def a_cache_of_this_run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[No
 
 @pytest.fixture(autouse=True, scope="session")
 def garbage_is_collected_rarely() -> None:
-    """Tracing makes so many objects that Python, where it has many already, would spend a third of the time on a
-    search for garbage among them.
-    """
+    """Tracing makes many objects, among which Python would look for garbage again and again."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(100_000, 20, 50)
