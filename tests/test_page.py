@@ -228,12 +228,21 @@ def test_replay_runs_from_its_file_alone(played: Page, browser: Browser, served:
 
 
 def test_a_key_kicks_and_the_ball_moves(seen: Page, served: Served) -> None:
-    before = pixels(seen)
     kicks(served, lambda: seen.keyboard.press("k"))
     assert served.live.run is not None
     assert served.live.run.summary["touched"]
-    assert np.linalg.norm(np.ptp(served.live.run.recording.path, axis=0)) > 0.5
-    until(lambda: changed_share(before, pixels(seen)) > 0.01)
+    path = served.live.run.recording.path
+    assert np.linalg.norm(np.ptp(path, axis=0)) > 0.5
+    column, row = map(round, placed(seen, served, path[0]))
+
+    def start_at(time_s: float) -> np.ndarray:
+        served.page.panel.move(time_s - served.page.panel.time)
+        time.sleep(1.0)
+        return pixels(seen)[row - 10 : row + 10, column - 10 : column + 10]
+
+    served.page.panel.playing = False
+    until(lambda: changed_share(start_at(0.0), start_at(1.0)) > 0.1)  # it has left the place where it lay
+    served.page.panel.playing = True
 
 
 def test_what_is_dragged_changes_the_plan(seen: Page, served: Served) -> None:
