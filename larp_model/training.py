@@ -21,7 +21,7 @@ from jax import Array
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from larp_model import losses, rotation
-from larp_model.detection import contact_points, first_contacts
+from larp_model.detection import first_contacts
 from larp_model.errors import InputError
 from larp_model.learned.model import Model, initial_weights
 from larp_model.learned.residual import ResidualModel
@@ -30,9 +30,8 @@ from larp_model.networks import Weights
 from larp_model.scene import Scene
 from larp_model.simulator import rollout
 from larp_model.state import Trajectories
+from larp_model.step_examples import StepExamples, step_loss, table_of
 
-# Errors of residual networks beyond this, in standard deviations, count linearly.
-LARGE = 0.1
 # Updates whose time tells how many fit into the time of a training.
 TIMED = 20
 
@@ -103,10 +102,10 @@ class Windows:
         self.share = share / share.sum()
         self.contacts = [first_contacts(scene.between, source) for source in self.sources]
 
-    def draw(self, random: np.random.Generator, steps: int) -> Batch:
-        """Return windows of so many steps."""
+    def rows(self, random: np.random.Generator, steps: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return the windows of so many steps that a batch takes from each source: episodes and first steps (n,)."""
         counts = random.multinomial(self.recipe.batch, self.share)
-        parts = []
+        rows = []
         for source, contacts, count in zip(self.sources, self.contacts, counts, strict=True):
             last = source.controls.shape[1] - steps
             # A contact so late that its windows would have to start more than `before_contact` earlier is left out.
@@ -121,8 +120,14 @@ class Windows:
             start = random.integers(last + 1, size=count)
             back = random.integers(self.recipe.before_contact + 1, size=near_contact)
             start[:near_contact] = np.clip(contacts[episodes[:near_contact]] - back, 0, last)
-            columns = start[:, None] + np.arange(steps + 1)
-            rows = episodes[:, None]
+            rows.append((episodes, start))
+        return rows
+
+    def draw(self, random: np.random.Generator, steps: int) -> Batch:
+        """Return windows of so many steps."""
+        parts = []
+        for source, (episodes, start) in zip(self.sources, self.rows(random, steps), strict=True):
+            columns, rows = start[:, None] + np.arange(steps + 1), episodes[:, None]
             parts.append(
                 (
                     source.states[rows, columns],
@@ -132,6 +137,17 @@ class Windows:
                 )
             )
         return Batch(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    def draw_examples(self, table: StepExamples, random: np.random.Generator, steps: int) -> StepExamples:
+        """Return the first steps of the windows that `draw` returns, from the table of all steps of the sources."""
+        rows, begin = list[np.ndarray](), 0
+        for source, (episodes, start) in zip(self.sources, self.rows(random, steps), strict=True):
+            count, length = source.controls.shape[:2]
+            rows.append(begin + episodes * length + start)
+            begin += count * length
+        numbers = np.concatenate(rows)
+        drawn: StepExamples = jax.tree.map(lambda values: values[numbers], table)
+        return drawn
 
 
 def statistics_of(model: Model, windows: Windows, random: np.random.Generator, batches: int = 32) -> Weights:
@@ -167,7 +183,10 @@ def learning_rate(recipe: Recipe, update: int) -> float:
 
 
 Update = Callable[[dict[str, Any], Any, Array, Any, float | Array], tuple[dict[str, Any], Any, dict[str, Array]]]
-"""(networks, the optimiser's state, key, `Batch`, learning rate) -> (networks, state, losses and norms by name)."""
+"""(networks, the optimiser's state, key, batch, learning rate) -> (networks, state, losses and norms by name).
+
+A batch is a `Batch`; of residual networks, which learn from single steps, it is `StepExamples`.
+"""
 
 
 def update_of(model: Model, recipe: Recipe, weights: Weights) -> Update:
@@ -178,10 +197,11 @@ def update_of(model: Model, recipe: Recipe, weights: Weights) -> Update:
     scene, transform = model.scene, optimiser(recipe)
     link_weights = emphasis(scene, recipe)
 
-    def loss_of(networks: dict[str, Any], states: Array, batch: Any) -> tuple[Array, dict[str, Array]]:
+    def loss_of(networks: dict[str, Any], batch: Any) -> tuple[Array, dict[str, Array]]:
         all_weights = weights._replace(networks=networks)
         if isinstance(model, ResidualModel):
-            return step_loss(model, all_weights, states, batch)
+            return step_loss(model, all_weights, batch)
+        states = batch.states
         predicted = rollout(
             model, all_weights, states[:, 0], batch.controls, batch.torques, batch.morphology,
             stop_gradient=recipe.stop_gradient,
@@ -191,12 +211,11 @@ def update_of(model: Model, recipe: Recipe, weights: Weights) -> Update:
     def update(
         networks: dict[str, Any], state: Any, key: Array, batch: Any, rate: float | Array
     ) -> tuple[dict[str, Any], Any, dict[str, Array]]:
-        states = batch.states
         if not model.invariant:
-            turn = rotation.random_turns(key, len(states))
-            states = rotation.turn_states(states, turn[:, None])
-            batch = batch._replace(torques=rotation.about_z(batch.torques, turn[:, None, None]))
-        (loss, terms), gradient = jax.value_and_grad(loss_of, has_aux=True)(networks, states, batch)
+            turn = rotation.random_turns(key, len(batch.states))
+            states = rotation.turn_states(batch.states, turn[:, None])
+            batch = batch._replace(states=states, torques=rotation.about_z(batch.torques, turn[:, None, None]))
+        (loss, terms), gradient = jax.value_and_grad(loss_of, has_aux=True)(networks, batch)
         norm = optax.tree.norm(gradient)
         accepted = jnp.isfinite(norm) & (norm < recipe.drop)
         gradient = jax.tree.map(lambda g: jnp.where(accepted, g, 0.0), gradient)
@@ -210,25 +229,6 @@ def update_of(model: Model, recipe: Recipe, weights: Weights) -> Update:
         )
 
     return update
-
-
-def step_loss(model: ResidualModel, weights: Weights, states: Array, batch: Any) -> tuple[Array, dict[str, Array]]:
-    """Return the loss of residual networks in the first steps of windows (B, T + 1, L, 13).
-
-    Errors are in standard deviations of the outputs; beyond `LARGE` they count linearly. Steps in which links of two
-    bodies touch are left out. Physics is evaluated once, and not differentiated.
-    """
-    before, after = states[:, 0], states[:, 1]
-    separate = jnp.ones(len(states))
-    for _, points in contact_points(model.scene, before, batch.morphology, after):
-        separate *= 1.0 - jnp.max(points.near, axis=1)
-    separate /= jnp.maximum(jnp.sum(separate), 1.0)
-    loss = jnp.zeros(())
-    arguments = batch.controls[:, 0], batch.torques[:, 0], batch.morphology
-    for name, inputs, outputs in model.examples(before, after, *arguments):
-        error = model.answer(weights, name, inputs) - weights.outputs[name].normalise(outputs)
-        loss += jnp.sum(separate * jnp.mean(losses.pseudo_huber(error**2, LARGE), axis=1))
-    return loss, {}
 
 
 class TrainingLog:
@@ -294,9 +294,12 @@ def train(
     # A checkpoint is written beside training: closing the manager, however training ends, waits for the last.
     board_folder = str(folder / "tensorboard")
     with closing(manager), _progress_bar(quiet) as bar, SummaryWriter(board_folder) as board:
-        task = bar.add_task("", total=recipe.updates, completed=first, note="")
+        task = bar.add_task("", total=recipe.updates, completed=first, note="physics of all steps, once")
+        draw: Callable[[np.random.Generator, int], Batch | StepExamples] = windows.draw
+        if isinstance(model, ResidualModel):
+            draw = partial(windows.draw_examples, table_of(model, windows.sources))
         while index < recipe.updates:
-            batch = windows.draw(np.random.default_rng((recipe.seed, index)), recipe.unroll(index))
+            batch = draw(np.random.default_rng((recipe.seed, index)), recipe.unroll(index))
             key = jax.random.fold_in(jax.random.key(recipe.seed), index)
             networks, state, terms = update(networks, state, key, batch, learning_rate(recipe, index))
             log.add(terms)

@@ -48,6 +48,7 @@ ORDER = [
     "larp_model.linearization",
     "larp_model.simulator",
     "larp_model.losses",
+    "larp_model.step_examples",
     "larp_model.training",
     "larp_model.prediction",
     "larp_model.launches",

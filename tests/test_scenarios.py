@@ -24,6 +24,7 @@ from larp_model.learned.model import initial_weights
 from larp_model.learned.residual import ResidualModel
 from larp_model.networks import Size, Weights
 from larp_model.physics import kinematics
+from larp_model.step_examples import examples_of
 from larp_model.training import Windows
 from tasks import train
 from tasks.benchmarks import model
@@ -180,7 +181,8 @@ def test_every_scene_can_be_trained(name: str) -> None:
         rest = drawn.controls[:, 0], drawn.torques[:, 0], drawn.morphology
         weights = initial_weights(made, key, made.measure(before, after, *map(jnp.asarray, rest)))
         state = training.optimiser(recipe).init(weights.networks)
-        return training.update_of(made, recipe, weights)(weights.networks, state, key, drawn, 1e-3)
+        examples = examples_of(made, before, after, *map(jnp.asarray, rest))
+        return training.update_of(made, recipe, weights)(weights.networks, state, key, examples, 1e-3)
 
     networks, _, terms = jax.eval_shape(update, jax.random.key(0))
     assert networks.keys() == made.networks().keys() and terms["loss"].shape == ()

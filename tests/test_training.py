@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.image import imread
@@ -23,8 +24,10 @@ from larp_model.engines.mujoco import Truth
 from larp_model.errors import InputError
 from larp_model.learned.model import Model
 from larp_model.learned.paper import PaperModel, Sizes
+from larp_model.learned.residual import ResidualModel
 from larp_model.networks import Size, Weights
 from larp_model.scene import Scene
+from larp_model.step_examples import examples_of, table_of
 from larp_model.training import Batch, Recipe, Windows, statistics_of, train
 from tasks.curve import curve_picture
 
@@ -40,6 +43,18 @@ def swings() -> Episodes:
     starts[..., 3], starts[..., 2] = 1.0, 3.0
     starts[..., 7:] = np.random.default_rng(0).standard_normal((16, 2, 6))
     return record(Truth(SWING, batch=16), starts, np.zeros((16, 20, 0, 3)))[0]
+
+
+def test_examples_from_the_table_are_those_of_the_windows_drawn(swings: Episodes) -> None:
+    model = ResidualModel(SWING, Size(2, 16))
+    shorter = swings._replace(states=swings.states[:5, 7:], controls=swings.controls[:5, 7:])
+    shorter = shorter._replace(torques=swings.torques[:5, 7:], morphology=swings.morphology[:5])
+    windows = Windows(SWING, [(swings, 1.0), (shorter, 1.0)], dataclasses.replace(SHORT, batch=64))
+    states, controls, torques, morphology = map(jnp.asarray, windows.draw(np.random.default_rng(3), 4))
+    of_windows = examples_of(model, states[:, 0], states[:, 1], controls[:, 0], torques[:, 0], morphology)
+    drawn = windows.draw_examples(table_of(model, windows.sources), np.random.default_rng(3), 4)
+    for one, other in zip(jax.tree.leaves(drawn), jax.tree.leaves(of_windows), strict=True):
+        np.testing.assert_allclose(one, other, atol=2e-5)  # of velocities up to 5 m/s, in 32 bits
 
 
 def same(first: Weights, second: Weights) -> bool:
