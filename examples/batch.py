@@ -1,14 +1,16 @@
 """Data set of many kicks, without a page: one npz file of targets, states and joint targets, in float32.
 
-python examples/batch.py 1000 runs/kicks.npz        # and, as a last argument, how many processes share the work
+python examples/batch.py --count 1000 --workers 4                   # by so many processes, one by default
+python examples/batch.py --count 1000 --workers tcp://host:8786     # by a Dask scheduler's, on any machines
+
+Needs `pip install 'larp-mpc[batch]'`. Kicks of a worker that dies are planned again by another one.
 """
 
-import sys
-from concurrent.futures import ProcessPoolExecutor
 from itertools import chain
-from multiprocessing import get_context
 
 import numpy as np
+import tyro
+from distributed import Client, as_completed
 from rich.progress import track
 
 from larp_model.files import written_whole
@@ -19,23 +21,27 @@ from tasks.targets import random_kick
 Row = tuple[np.ndarray, np.ndarray, np.ndarray, float, bool]
 
 
-def kicks(session: Session, numbers: np.ndarray, seed: int) -> list[Row]:
-    """Return kicks to random targets, with the ball's place moved a little each time; compiled once."""
+def kicks(session: Session, numbers: list[int], seed: int) -> list[Row]:
+    """Return kicks to random targets, with the ball's place moved a little each time; compiled once a worker."""
     rows = []
-    for number in track(numbers.tolist(), "kicks"):
+    for number in numbers:
         target, offset = random_kick(np.random.default_rng((seed, number)))
         run = session.run(target, "fast", number, session.task.start(offset))
         rows.append((target, run.states, run.joint_targets, run.truth_error_m, run.summary["fell"]))
     return rows
 
 
-def main(count: int = 1000, path: str = "runs/kicks.npz", processes: int = 1, seed: int = 0) -> None:
-    """Share the kicks among processes, gather them, write the file."""
-    shares = np.array_split(np.arange(count), processes)
-    # Spawned, not forked: JAX has threads, which a fork would lack and wait for.
-    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
-        made = pool.map(kicks, [Session(Kick.standard())] * processes, shares, [seed] * processes)
-        targets, states, controls, errors, fell = zip(*chain.from_iterable(made), strict=True)
+def main(count: int = 1000, path: str = "runs/kicks.npz", workers: int | str = 1, seed: int = 0) -> None:
+    """Share the kicks among workers, a number of processes here or a scheduler's, gather them, write the file."""
+    local = {"n_workers": workers, "threads_per_worker": 1, "host": "127.0.0.1", "dashboard_address": None}
+    with Client(**local) if isinstance(workers, int) else Client(workers) as client:
+        # Made by a worker, so that it can be made again; the others copy it.
+        session = client.submit(lambda: Session(Kick.standard()))
+        # What a worker plans in a row, and again if another dies.
+        shares = np.array_split(np.arange(count), max(1, min(count, 100)))
+        futures = [client.submit(kicks, session, share.tolist(), seed) for share in shares]
+        list(track(as_completed(futures), "kicks", total=len(futures)))
+        targets, states, controls, errors, fell = zip(*chain.from_iterable(client.gather(futures)), strict=True)
     steps = min(map(len, states))  # longer kicks are cut to this length
     arrays = {
         "targets": np.array(targets, np.float32),  # (N, 3) [m]
@@ -51,4 +57,4 @@ def main(count: int = 1000, path: str = "runs/kicks.npz", processes: int = 1, se
 
 
 if __name__ == "__main__":
-    main(*(kind(each) for kind, each in zip((int, str, int), sys.argv[1:], strict=False)))
+    tyro.cli(main)

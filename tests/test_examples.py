@@ -6,10 +6,12 @@ import json
 import runpy
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 from larp_model.runtime import prepare_compiler
@@ -46,11 +48,21 @@ def test_what_an_example_says_of_itself_holds(
 
 
 @pytest.mark.slow
-def test_kicks_are_shared_among_processes(tmp_path: Path) -> None:
+def test_kicks_of_a_worker_that_dies_are_planned_by_another(tmp_path: Path) -> None:
     path = tmp_path / "kicks.npz"
-    subprocess.run([sys.executable, EXAMPLES / "batch.py", "2", path, "2"], check=True, capture_output=True)
+    batch = subprocess.Popen([sys.executable, EXAMPLES / "batch.py", "--count=3", f"--path={path}", "--workers=2"])
+    while not (busy := [worker for worker in workers_of(batch.pid) if worker.cpu_times().user > 4.0]):
+        assert batch.poll() is None
+        time.sleep(0.1)
+    busy[0].kill()
+    assert batch.wait() == 0
     with np.load(path, allow_pickle=False) as kicks:
-        assert kicks["states"].shape[0] == len(np.unique(kicks["targets"], axis=0)) == 2
+        assert kicks["states"].shape[0] == len(np.unique(kicks["targets"], axis=0)) == 3
+
+
+def workers_of(pid: int) -> list[psutil.Process]:
+    """Return the processes that a batch has spawned."""
+    return [child for child in psutil.Process(pid).children() if "spawn_main" in " ".join(child.cmdline())]
 
 
 def test_the_notebook_runs_and_shows_its_replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
