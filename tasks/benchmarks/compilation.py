@@ -1,4 +1,4 @@
-"""Cost of compiling a step of the kick and its gradient, part by part: operations, tracing, XLA, memory and time."""
+"""Cost of compiling a step of the kick and its derivatives, part by part: operations, tracing, XLA, memory and time."""
 
 from __future__ import annotations
 
@@ -38,10 +38,11 @@ COLUMNS = ("JAX", "HLO", "trace [s]", "XLA [s]", "[MB]", "run [ms]")
 
 
 class Part(NamedTuple):
-    """A part of a step: a function of arrays, and arrays."""
+    """A part of a step: a function of arrays, arrays, and whether its gradient is measured as well."""
 
     function: Callable[..., Any]
     inputs: tuple[Any, ...]
+    has_gradient: bool = True
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,9 @@ def parts(settings: CompilationSettings) -> dict[str, Part]:
         return one.before_contacts(start, start.state, dt, False)[1:]
 
     links, rates, articulations, gaps = before_contacts(start)
-    controls = copies(reference.controls[begin : begin + settings.steps])
+    window = slice(begin, begin + settings.steps)
+    controls = copies(reference.controls[window])
+    trajectory = jnp.asarray(reference.states[window], jnp.float32), jnp.asarray(reference.controls[window])
     return {
         "kinematics": Part(lambda state: kinematics(scene, state, start.sizes), (start.state,)),
         "human": Part(
@@ -105,6 +108,7 @@ def parts(settings: CompilationSettings) -> dict[str, Part]:
             lambda states, controls: rollout(model.model, model.weights, states, controls, morphology=sizes),
             (copies(reference.states[begin]), controls),
         ),
+        f"linearize {settings.steps} steps of one scene": Part(model.linearize, trajectory, False),
     }
 
 
@@ -164,7 +168,7 @@ def main(
     json: Path = Path("runs/benchmarks/compilation.json"),
     publish: bool = False,
 ) -> None:
-    """Compile each part of a step of the kick, and its gradient, without a cache.
+    """Compile each part of a step of the kick, its gradient, and the Jacobians of steps, without a cache.
 
     Args:
         batch: scenes side by side.
@@ -185,7 +189,7 @@ def main(
 
     jobs: dict[str, Callable[[], report.Row]] = {}
     for name, part in parts(settings).items():
-        for direction in ("forward", "gradient"):
+        for direction in ("forward", "gradient")[: 1 + part.has_gradient]:
             labels = {"part": name, "direction": direction}
             jobs[f"{name}, {direction}"] = partial(lambda labels, *of: labels | one(*of), labels, part, direction)
     rows = report.collect(json, settings.command, jobs)
@@ -193,7 +197,7 @@ def main(
     report.show(table(rows))
     if publish:
         report.publish(
-            "compilation", "Compilation: a step and its gradient, part by part", settings.command, table(rows)
+            "compilation", "Compilation: a step and its derivatives, part by part", settings.command, table(rows)
         )
 
 
