@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import gc
+import math
 import os
 import time
 from collections.abc import Iterator
@@ -28,6 +29,8 @@ COMPILER_FLAGS = {
 MEASURED_VERSIONS = "0.10."
 # So many of a CPU's cores are devices at most: the batches of a planner do not suffice for more.
 MOST_DEVICES = 8
+# Memory that is asked for without a look at what is free [bytes].
+LITTLE = 2**28
 DEVICES_FLAG = "xla_force_host_platform_device_count"
 
 
@@ -76,6 +79,28 @@ def prepare_compiler() -> None:
 def cores() -> int:
     """Return how many processors this process may use, which can be fewer than the machine has."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def free_memory() -> float:
+    """Return the memory that arrays can still take where JAX computes [bytes]; infinite where no one says."""
+    if statistics := jax.devices()[0].memory_stats():
+        return float(statistics["bytes_limit"] - statistics["bytes_in_use"])
+    with suppress(OSError, StopIteration):
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        return 1024.0 * int(next(line.split()[1] for line in lines if line.startswith("MemAvailable:")))
+    return math.inf
+
+
+def require_memory(name: str, rows: int, bytes_a_row: int) -> None:
+    """Raise InputError where an argument has more rows than results of this size leave memory for."""
+    if rows * bytes_a_row < LITTLE:
+        return
+    free = free_memory()
+    if rows * bytes_a_row > free:
+        raise InputError(
+            f"{name} has {rows} rows, whose results need {1e-9 * rows * bytes_a_row:.3g} GB, but {1e-9 * free:.3g} GB "
+            f"are free: take at most {int(free / bytes_a_row)} at a time"
+        )
 
 
 def one_blas_thread() -> AbstractContextManager[Any]:

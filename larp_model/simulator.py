@@ -25,9 +25,12 @@ from larp_model.learned.residual import ResidualModel
 from larp_model.linearization import linearized
 from larp_model.networks import Weights
 from larp_model.physics.kinematics import morphology_of
-from larp_model.runtime import prepare_compiler
+from larp_model.runtime import prepare_compiler, require_memory
 from larp_model.scene import Scene
 from larp_model.sharding import shared
+
+# Of its result, a rollout holds so many at a time.
+COPIES = 3
 
 
 def step(
@@ -112,6 +115,9 @@ class Simulator:
         start, targets, *_ = arguments
         if start.shape[0] == 0:
             return jnp.zeros((0, targets.shape[1], *start.shape[1:]), start.dtype)
+        if isinstance(start.shape[0], int):  # no symbol
+            row = targets.shape[1] * start.shape[1] * packed.SIZE * start.dtype.itemsize
+            require_memory("state", start.shape[0], COPIES * row)
         states = _rollout(self.model, self.weights, *arguments, steps)
         diverged = jnp.cumsum(~packed.healthy(states), axis=1) > 0
         return jnp.where(diverged[..., None, None], jnp.nan, states)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import psutil
 import pytest
 from jax._src.compilation_cache import compress_executable
 from jax.experimental.compilation_cache import compilation_cache
@@ -43,6 +44,10 @@ def test_a_device_that_is_missing_is_named_in_one_line() -> None:
     )
     assert ended.returncode == 2 and ended.stderr.count("\n") == 1
     assert ended.stderr.startswith("error: JAX_PLATFORMS is 'cuda', but")
+
+
+def test_free_memory_is_what_the_machine_says() -> None:
+    assert 1e8 < runtime.free_memory() <= psutil.virtual_memory().total
 
 
 @pytest.mark.parametrize(

@@ -248,6 +248,15 @@ def test_shapes_that_do_not_fit_are_refused(
         residual_simulator.rollout(jnp.zeros(state), jnp.zeros(controls))
 
 
+def test_rows_that_do_not_fit_into_memory_are_refused_with_how_many_would(
+    residual_simulator: Simulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("larp_model.runtime.free_memory", lambda: 1e8)
+    message = r"^state has 70000 rows, whose results need 0\.306 GB, but 0\.1 GB are free: take at most 22893 at a "
+    with pytest.raises(InputError, match=message):
+        residual_simulator.rollout(np.zeros((70000, 14, 13), np.float32), np.zeros((70000, 2, 12, 3)))
+
+
 @pytest.mark.parametrize(("layers", "width", "named"), [(2, 0, "width is 0"), (0, 8, "layers is 0"), (2, 1.5, "1.5")])
 def test_a_size_that_makes_no_sense_is_refused_by_name(layers: int, width: int, named: str) -> None:
     with pytest.raises(InputError, match=named):
