@@ -1,4 +1,4 @@
-"""Setup of JAX: a check of its device, XLA's way to compile for CPUs, a compilation cache that processes share."""
+"""Setup of JAX: its device and memory, XLA's way to compile for CPUs, a compilation cache that processes share."""
 
 from __future__ import annotations
 
@@ -82,9 +82,13 @@ def cores() -> int:
 
 
 def free_memory() -> float:
-    """Return the memory that arrays can still take where JAX computes [bytes]; infinite where no one says."""
-    if statistics := jax.devices()[0].memory_stats():
-        return float(statistics["bytes_limit"] - statistics["bytes_in_use"])
+    """Return the memory that arrays can still take where JAX computes [bytes]; infinite where no one says.
+
+    Of several GPUs, which share a batch, that of all together.
+    """
+    statistics = [device.memory_stats() for device in jax.devices()]
+    if all(statistics):
+        return float(sum(values["bytes_limit"] - values["bytes_in_use"] for values in statistics))
     with suppress(OSError, StopIteration):
         lines = Path("/proc/meminfo").read_text().splitlines()
         return 1024.0 * int(next(line.split()[1] for line in lines if line.startswith("MemAvailable:")))

@@ -115,7 +115,7 @@ class Simulator:
         start, targets, *_ = arguments
         if start.shape[0] == 0:
             return jnp.zeros((0, targets.shape[1], *start.shape[1:]), start.dtype)
-        if isinstance(start.shape[0], int):  # no symbol
+        if not isinstance(start, jax.core.Tracer):  # which may be for another machine
             row = targets.shape[1] * start.shape[1] * packed.SIZE * start.dtype.itemsize
             require_memory("state", start.shape[0], COPIES * row)
         states = _rollout(self.model, self.weights, *arguments, steps)

@@ -294,9 +294,10 @@ def train(
     # A checkpoint is written beside training: closing the manager, however training ends, waits for the last.
     board_folder = str(folder / "tensorboard")
     with closing(manager), _progress_bar(quiet) as bar, SummaryWriter(board_folder) as board:
-        task = bar.add_task("", total=recipe.updates, completed=first, note="physics of all steps, once")
+        task = bar.add_task("", total=recipe.updates, completed=first, note="")
         draw: Callable[[np.random.Generator, int], Batch | StepExamples] = windows.draw
         if isinstance(model, ResidualModel):
+            bar.update(task, note="physics of all steps, once")
             draw = partial(windows.draw_examples, table_of(model, windows.sources))
         while index < recipe.updates:
             batch = draw(np.random.default_rng((recipe.seed, index)), recipe.unroll(index))

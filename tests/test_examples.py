@@ -7,6 +7,7 @@ import runpy
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ def test_what_an_example_says_of_itself_holds(
 def test_kicks_of_a_worker_that_dies_are_planned_by_another(tmp_path: Path) -> None:
     path = tmp_path / "kicks.npz"
     batch = subprocess.Popen([sys.executable, EXAMPLES / "batch.py", "--count=3", f"--path={path}", "--workers=2"])
-    while not (busy := [worker for worker in workers_of(batch.pid) if worker.cpu_times().user > 4.0]):
+    while not (busy := busy_workers(batch.pid)):
         assert batch.poll() is None
         time.sleep(0.1)
     busy[0].kill()
@@ -60,9 +61,14 @@ def test_kicks_of_a_worker_that_dies_are_planned_by_another(tmp_path: Path) -> N
         assert kicks["states"].shape[0] == len(np.unique(kicks["targets"], axis=0)) == 3
 
 
-def workers_of(pid: int) -> list[psutil.Process]:
-    """Return the processes that a batch has spawned."""
-    return [child for child in psutil.Process(pid).children() if "spawn_main" in " ".join(child.cmdline())]
+def busy_workers(pid: int) -> list[psutil.Process]:
+    """Return the workers of a batch that have imported what they need, and compile or plan."""
+    busy = []
+    for child in psutil.Process(pid).children():
+        with suppress(psutil.NoSuchProcess):  # it has ended meanwhile
+            if "spawn_main" in " ".join(child.cmdline()) and child.cpu_times().user > 4.0:
+                busy.append(child)
+    return busy
 
 
 def test_the_notebook_runs_and_shows_its_replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

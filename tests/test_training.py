@@ -54,7 +54,7 @@ def test_examples_from_the_table_are_those_of_the_windows_drawn(swings: Episodes
     of_windows = examples_of(model, states[:, 0], states[:, 1], controls[:, 0], torques[:, 0], morphology)
     drawn = windows.draw_examples(table_of(model, windows.sources), np.random.default_rng(3), 4)
     for one, other in zip(jax.tree.leaves(drawn), jax.tree.leaves(of_windows), strict=True):
-        np.testing.assert_allclose(one, other, atol=2e-5)  # of velocities up to 5 m/s, in 32 bits
+        np.testing.assert_allclose(one, other, atol=2e-5)  # errors are differences of velocities
 
 
 def same(first: Weights, second: Weights) -> bool:

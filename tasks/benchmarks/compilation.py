@@ -38,11 +38,11 @@ COLUMNS = ("JAX", "HLO", "trace [s]", "XLA [s]", "[MB]", "run [ms]")
 
 
 class Part(NamedTuple):
-    """A part of a step: a function of arrays, arrays, and whether its gradient is measured as well."""
+    """A part of a step: a function of arrays, arrays, and the directions in which it is measured."""
 
     function: Callable[..., Any]
     inputs: tuple[Any, ...]
-    has_gradient: bool = True
+    directions: tuple[str, ...] = ("forward", "gradient")
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def parts(settings: CompilationSettings) -> dict[str, Part]:
             lambda states, controls: rollout(model.model, model.weights, states, controls, morphology=sizes),
             (copies(reference.states[begin]), controls),
         ),
-        f"linearize {settings.steps} steps of one scene": Part(model.linearize, trajectory, False),
+        f"linearize {settings.steps} steps of one scene": Part(model.linearize, trajectory, ("forward",)),
     }
 
 
@@ -189,7 +189,7 @@ def main(
 
     jobs: dict[str, Callable[[], report.Row]] = {}
     for name, part in parts(settings).items():
-        for direction in ("forward", "gradient")[: 1 + part.has_gradient]:
+        for direction in part.directions:
             labels = {"part": name, "direction": direction}
             jobs[f"{name}, {direction}"] = partial(lambda labels, *of: labels | one(*of), labels, part, direction)
     rows = report.collect(json, settings.command, jobs)
