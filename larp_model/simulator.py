@@ -22,7 +22,7 @@ from larp_model.bodies import usual
 from larp_model.errors import InputError
 from larp_model.learned.model import Model
 from larp_model.learned.residual import ResidualModel
-from larp_model.linearization import linearized
+from larp_model.linearization import Coordinates, linearized
 from larp_model.networks import Weights
 from larp_model.physics.kinematics import morphology_of
 from larp_model.runtime import prepare_compiler, require_memory
@@ -137,6 +137,20 @@ class Simulator:
         by_state, by_control = _linearized(self.model, self.weights, start, targets, sizes)
         return by_state.reshape(*lead, *by_state.shape[1:]), by_control.reshape(*lead, *by_control.shape[1:])
 
+    def difference(self, states: ArrayLike, references: ArrayLike) -> Array:
+        """Return the coordinates (*, 2 V) of states (*, L, 13) near references (*, L, 13): see `linearization`."""
+        state, reference = jnp.broadcast_arrays(_array("states", states), _array("references", references))
+        flat = (array.reshape(-1, *array.shape[-2:]) for array in (state, reference))
+        coordinates: Array = _difference(self.scene, *flat).reshape(*state.shape[:-2], -1)
+        return coordinates
+
+    def basis(self, states: ArrayLike) -> Array:
+        """Return changes (*, L, 13, 2 V) of states (*, L, 13) per unit of each coordinate: see `linearization`."""
+        state = _array("states", states)
+        flat = _basis(self.scene, state.reshape(-1, *state.shape[-2:]), jnp.asarray(self.morphology, state.dtype))
+        changes: Array = flat.reshape(*state.shape, -1)
+        return changes
+
     def _checked(
         self, state: ArrayLike, control: ArrayLike, torque: ArrayLike | None, morphology: ArrayLike | None,
         steps: tuple[int, ...],
@@ -211,6 +225,22 @@ def _linearized(model: Model, weights: Weights, state: Array, control: Array, si
         return step(model, weights, state, control, morphology=sizes)
 
     return linearized(model.scene, one_step, state, control, jnp.broadcast_to(sizes, (len(state), *sizes.shape[1:])))
+
+
+@partial(jax.jit, static_argnums=0, inline=True)
+def _difference(scene: Scene, state: Array, reference: Array) -> Array:
+    return Coordinates(scene).difference(*(jnp.moveaxis(array, 0, -1) for array in (state, reference))).T
+
+
+@partial(jax.jit, static_argnums=0, inline=True)
+def _basis(scene: Scene, state: Array, sizes: Array) -> Array:
+    coordinates, last = Coordinates(scene), jnp.moveaxis(state, 0, -1)
+    count, batch = 2 * coordinates.count, state.shape[0]
+
+    def change(direction: Array) -> Array:
+        return coordinates.change(last, sizes[..., None], jnp.broadcast_to(direction[:, None], (count, batch)))
+
+    return jnp.moveaxis(jax.vmap(change)(jnp.eye(count, dtype=state.dtype)), (0, -1), (-1, 0))
 
 
 def _by_row(

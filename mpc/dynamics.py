@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeGuard, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,26 @@ class Dynamics(Protocol):
         Pure, traceable by JAX, and every row independent of the others. A row that diverged holds NaN. steps (): only
         so many of the H are computed; the rest of them repeat the last. A planner that needs all does not pass it.
         """
+
+
+@runtime_checkable
+class Linearizable(Dynamics, Protocol):
+    """Dynamics whose steps have derivatives by coordinates of small changes of a state, n of them.
+
+    `larp_model.Simulator` is one.
+    """
+
+    def linearize(self, states: jax.Array, controls: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return A (H, n, n) and B (H, n, 3 J): steps from states (H, L, 13), controls (H, J, 3) [rad] add A d + B v.
+
+        d (n,): small deviations of states. v (3 J,): small changes of controls [rad].
+        """
+
+    def difference(self, states: jax.Array, references: jax.Array) -> jax.Array:
+        """Return the coordinates (H, n) of the deviations of states (H, L, 13) from references (H, L, 13)."""
+
+    def basis(self, states: jax.Array) -> jax.Array:
+        """Return derivatives (H, L, 13, n) of states (H, L, 13) by their coordinates."""
 
 
 def side_by_side(dynamics: Dynamics) -> int:
@@ -111,9 +131,12 @@ class Continued:
 
     def rollout(self, state: jax.Array, controls: jax.Array, *, steps: jax.Array | None = None) -> jax.Array:
         """Return the states of `Dynamics.rollout`; H' = H + `self.steps`."""
-        states = self.dynamics.rollout(state, controls, **({} if steps is None else {"steps": steps}))
+        return self.continued(self.dynamics.rollout(state, controls, **({} if steps is None else {"steps": steps})))
+
+    def continued(self, states: jax.Array) -> jax.Array:
+        """Return the states (N, H', L, 13) of a rollout from those of its H steps under control, (N, H, L, 13)."""
         last = states[:, -1]
-        tail_states = self.tail.rollout(last[:, self.links], jnp.zeros((len(state), self.steps, 0, 3)))
+        tail_states = self.tail.rollout(last[:, self.links], jnp.zeros((len(states), self.steps, 0, 3)))
         frozen = jnp.repeat(last[:, None], self.steps, axis=1)
         return jnp.concatenate([states, frozen.at[:, :, self.links].set(tail_states)], axis=1)
 
@@ -126,3 +149,20 @@ class Continued:
         """Return the dynamics of flattened ones; inside JAX the models may be placeholders."""
         begin, end, steps = fields
         return cls(*models, slice(begin, end), steps)
+
+
+def linearizable(dynamics: Dynamics) -> TypeGuard[Linearizable | Continued]:
+    """Return whether the steps under control have derivatives, as feedback needs."""
+    return isinstance(dynamics.dynamics if isinstance(dynamics, Continued) else dynamics, Linearizable)
+
+
+def of_steps(dynamics: Linearizable | Continued) -> Linearizable:
+    """Return the dynamics of the steps under control."""
+    steps = dynamics.dynamics if isinstance(dynamics, Continued) else dynamics
+    assert isinstance(steps, Linearizable)
+    return steps
+
+
+def continued(dynamics: Dynamics, states: jax.Array) -> jax.Array:
+    """Return the states (N, H', L, 13) of a rollout from those of its H steps under control, (N, H, L, 13)."""
+    return dynamics.continued(states) if isinstance(dynamics, Continued) else states

@@ -9,6 +9,7 @@ from typing import NamedTuple, Protocol
 import jax
 import numpy as np
 
+from mpc.feedback import Feedback, FeedbackInfo
 from mpc.planner import Plan, PlanInfo, Planner, Window
 
 
@@ -38,7 +39,8 @@ class Phase(NamedTuple):
     knots. window: returns the window that begins at a step. is_done: returns whether the phase ends at a step in a
     state (L, 13); its plan is then executed for `hold_steps` more before the next phase begins. After the last phase
     nothing is planned any more. A phase whose first planner is the `replan` of the phase before continues with its
-    plan. links: those that the planners' dynamics have.
+    plan. links: those that the planners' dynamics have. feedback: whether the joint targets of plans answer deviations
+    from what they predict, with gains computed once, around the first plan: see `mpc.feedback`.
     """
 
     first: Planner
@@ -48,16 +50,21 @@ class Phase(NamedTuple):
     is_done: Callable[[int, np.ndarray], bool] = never
     hold_steps: int = 0
     links: slice = slice(None)
+    feedback: bool = False
 
 
 class PlanRecord(NamedTuple):
-    """A plan with its step and phase, the state (L, 13) that it began from, and its `PlanInfo`."""
+    """A plan with its step and phase, the state (L, 13) that it began from, and its figures.
+
+    feedback: those of the feedback that was computed around it, if any.
+    """
 
     step: int
     phase: int
     state: np.ndarray
     plan: Plan
     info: PlanInfo
+    feedback: FeedbackInfo | None = None
 
 
 @dataclass
@@ -88,6 +95,50 @@ class Checkpoint(NamedTuple):
         return Checkpoint(np.stack(execution.states), np.stack(execution.controls), last.plan, last.step, last.phase)
 
 
+@dataclass
+class Followed:
+    """A plan that is being executed: joint targets (H, J, 3) [rad] from a step on, and feedback around it, if any.
+
+    sums: see `feedback.Feedback`.
+    """
+
+    plan: Plan
+    step: int
+    controls: np.ndarray
+    feedback: Feedback | None = None
+    sums: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+    def target(self, step: int, state: np.ndarray) -> np.ndarray | None:
+        """Return the joint targets (J, 3) [rad] of a step in a state (L, 13), or None after the plan's end."""
+        number = step - self.step
+        if number >= len(self.controls):
+            return None
+        if self.feedback is None:
+            control: np.ndarray = self.controls[number]
+            return control
+        self.sums, control = self.feedback.step(self.sums, number, state)
+        return control
+
+
+def follow(
+    phase: Phase, index: int, step: int, state: np.ndarray, last: Followed | None, key: jax.Array
+) -> tuple[Followed, PlanRecord]:
+    """Return a plan that a phase, the `index`-th, makes in a state (L, 13) of a step, after its last one, if any."""
+    planner, window = phase.first if last is None else phase.replan, phase.window(step)
+    warm_start = planner.init(jax.random.fold_in(key, index), window.time) if last is None else last.plan
+    plan, info = planner.step(warm_start, state, window)
+    followed = Followed(plan, step, np.asarray(planner.controls(plan, window.reference)))
+    feedback_info = None
+    if phase.feedback:
+        if last is None or last.feedback is None:
+            followed.feedback, feedback_info = planner.feedback(plan, info, state, window)
+        else:
+            predicted = planner.predicted(info, state, window)
+            followed.feedback = last.feedback.around(followed.controls, predicted, step - last.step)
+        followed.sums = followed.feedback.init()
+    return followed, PlanRecord(step, index, state, plan, info, feedback_info)
+
+
 def execute(
     world: World,
     state: np.ndarray,
@@ -102,16 +153,17 @@ def execute(
 
     After the last phase its plan is executed and, after the plan's end, the task's reference. observe: called after
     every step. sense: returns the state that the planners get in a true state (L, 13); the same by default.
-    checkpoint: to continue from; the plans in the result are then those from there on. Raises `DivergenceError` as soon
-    as the world diverges.
+    checkpoint: to continue from, without feedback until the next plan; the plans in the result are then those from
+    there on. Raises `DivergenceError` as soon as the world diverges.
     """
-    execution = Execution([np.asarray(state)])
-    phase_index, plan, plan_step, targets = 0, None, 0, np.zeros(0)
+    execution, phase_index = Execution([np.asarray(state)]), 0
+    followed: Followed | None = None
     end_step: int | None = None
     if checkpoint is not None:
         execution = Execution([*checkpoint.states], [*checkpoint.controls])
-        plan, plan_step, phase_index = checkpoint.plan, checkpoint.step, checkpoint.phase
-        targets = np.asarray(phases[phase_index].replan.controls(plan, phases[phase_index].window(plan_step).reference))
+        phase_index, planner = checkpoint.phase, phases[checkpoint.phase].replan
+        targets = planner.controls(checkpoint.plan, phases[phase_index].window(checkpoint.step).reference)
+        followed = Followed(checkpoint.plan, checkpoint.step, np.asarray(targets))
     world.reset(execution.states[-1][None])
     for step in range(len(execution.controls), steps):
         sensed = sense(execution.states[-1])
@@ -121,17 +173,15 @@ def execute(
             if end_step is None or step < end_step:
                 break
             if phases[phase_index + 1 :] and phases[phase_index + 1].first is not phases[phase_index].replan:
-                plan = None
+                followed = None
             phase_index, end_step = phase_index + 1, None
         phase = phases[min(phase_index, len(phases) - 1)]
-        if phase_index < len(phases) and (plan is None or (end_step is None and step - plan_step >= phase.interval)):
-            planner, window = phase.first if plan is None else phase.replan, phase.window(step)
-            warm_start = planner.init(jax.random.fold_in(key, phase_index), window.time) if plan is None else plan
-            plan, info = planner.step(warm_start, sensed[phase.links], window)
-            targets, plan_step = np.asarray(planner.controls(plan, window.reference)), step
-            execution.plans.append(PlanRecord(step, phase_index, sensed, plan, info))
-        offset = step - plan_step
-        control = targets[offset] if offset < len(targets) else np.asarray(phase.window(step).reference)[0]
+        planning, seen = phase_index < len(phases), sensed[phase.links]
+        if planning and (followed is None or (end_step is None and step - followed.step >= phase.interval)):
+            followed, record = follow(phase, phase_index, step, seen, followed, key)
+            execution.plans.append(record._replace(state=sensed))
+        target = None if followed is None else followed.target(step, seen)
+        control = np.asarray(phase.window(step).reference)[0] if target is None else target
         execution.controls.append(control)
         next_state = world.step(control[None])[0]
         if not np.isfinite(next_state).all():

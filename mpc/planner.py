@@ -15,8 +15,9 @@ from jax.typing import ArrayLike
 from larp_model.errors import InputError
 from larp_model.runtime import one_blas_thread, prepare_compiler
 from mpc.cost import CostTerm, require_weight
-from mpc.dynamics import Dynamics
-from mpc.problem import Equations, Inputs, PlannerProblem, Programs
+from mpc.dynamics import Dynamics, linearizable, of_steps
+from mpc.feedback import Feedback, FeedbackInfo, LinearQuadratic, finite_part, riccati
+from mpc.problem import Equations, Inputs, PlannerProblem, Programs, program_of
 from mpc.search import COLOUR, Optimizer, Search, coloured_noise
 from mpc.spline import Interpolation, shift
 
@@ -208,6 +209,45 @@ class Planner:
         """Return joint targets (H, J, 3) [rad] of the plan, given the reference (H, J, 3) it was made around."""
         controls: jax.Array = _controls(self._equations, plan.knots, self._reference(reference))
         return controls
+
+    def predicted(self, info: PlanInfo, state: ArrayLike, window: Window) -> np.ndarray:
+        """Return the states (S + 1, L, 13) of a plan made in `state` for a window, from there on, under control."""
+        return np.concatenate([np.asarray(state)[None], info.states[: window.steps or self.horizon]])
+
+    def feedback(self, plan: Plan, info: PlanInfo, state: ArrayLike, window: Window) -> tuple[Feedback, FeedbackInfo]:
+        """Return feedback around a plan that `step` made in `state` (L, 13) for a window.
+
+        There is none from where the dynamics diverge, or where their derivatives are not finite.
+        """
+        if not linearizable(self.dynamics):
+            raise InputError(f"dynamics: got {type(self.dynamics).__name__}, needs `linearize` for feedback")
+        inputs, states = self._inputs(plan, state, window), self.predicted(info, state, window)
+        begin, compiled_before = time.perf_counter(), self._programs.seconds
+        rest = np.repeat(states[-1:], self.horizon + 1 - len(states), axis=0)
+        function, arguments = program_of(self._equations.linear_quadratic, self.dynamics)
+        all_states = np.concatenate([states, rest]).astype(np.float32)
+        problem = LinearQuadratic(
+            *map(np.asarray, self._programs("feedback", function, *arguments, inputs, plan.knots, all_states))
+        )
+        states = finite_part(states)
+        if all(np.isfinite(array).all() for array in problem):
+            with one_blas_thread():
+                gains = riccati(problem)
+        else:
+            gains, states = np.zeros((len(problem.by_control), 0, 0)), states[:1]
+        feedback = Feedback(
+            of_steps(self.dynamics),
+            np.asarray(self.controls(plan, window.reference)),
+            states,
+            gains,
+            problem.sum_by_state,
+            problem.sum_by_control,
+            self.lower,
+            self.upper,
+        )
+        compile_seconds = self._programs.seconds - compiled_before
+        seconds = time.perf_counter() - begin - compile_seconds
+        return feedback, FeedbackInfo(float(np.abs(gains).max(initial=0.0)), seconds, compile_seconds)
 
     def _shift(self, elites: jax.Array, spread: jax.Array, elapsed: jax.Array) -> tuple[jax.Array, jax.Array]:
         times = jnp.asarray(self.knot_times)

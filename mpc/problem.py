@@ -14,7 +14,8 @@ import numpy as np
 
 from larp_model.runtime import no_garbage_collection
 from mpc.cost import CostTerm, curvatures, evaluate, residuals, weighted_cost
-from mpc.dynamics import Dynamics, side_by_side
+from mpc.dynamics import Continued, Dynamics, Linearizable, continued, of_steps, side_by_side
+from mpc.feedback import LinearQuadratic, linear_quadratic
 from mpc.search import Evaluations, Residuals
 from mpc.spline import Interpolation, interpolate
 
@@ -92,6 +93,25 @@ class Equations:
             return residuals(self.terms, states, controls, inputs.context)
 
         return jax.vmap(lambda direction: jax.jvp(residuals_of, (knots,), (direction,))[1])(directions)
+
+    def linear_quadratic(
+        self, dynamics: Linearizable | Continued, inputs: Inputs, knots: jax.Array, states: jax.Array
+    ) -> LinearQuadratic:
+        """Return the problem of feedback around knots (K, J, 3) and the states (H + 1, L, 13) that they pass."""
+
+        def residuals_of(states: jax.Array, controls: jax.Array) -> dict[str, jax.Array]:
+            return residuals(self.terms, continued(dynamics, states[None])[0], controls, inputs.context)
+
+        controls = self.controls(knots, inputs.reference)
+        touched = curvatures(self.terms, residuals_of(states[1:], controls), inputs.weights)
+        problem = linear_quadratic(of_steps(dynamics), residuals_of, touched, states, controls)
+        if inputs.steps is None:
+            return problem
+        computed = (jnp.arange(len(controls)) < inputs.steps)[:, None, None]
+        return problem._replace(
+            by_state=jnp.where(computed, problem.by_state, jnp.eye(problem.by_state.shape[1])),
+            by_control=jnp.where(computed, problem.by_control, 0.0),
+        )
 
     def plan_cost(self, inputs: Inputs, knots: jax.Array, states: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Return the cost and each term's share of knots (K, J, 3) that led to states (H', L, 13)."""

@@ -198,7 +198,7 @@ def run_once(session: Session, goal: np.ndarray, plans: PlanOptions, outputs: Ou
     outputs.tell("planning and executing; what is new is compiled first")
     kick = session.run(goal, plans.preset, plans.seed)
     kick.summary["preset"] = plans.label
-    infos = [plan.info for plan in kick.execution.plans]
+    infos = [info for plan in kick.execution.plans for info in (plan.info, plan.feedback) if info is not None]
     compiling, planning = (sum(getattr(info, name) for info in infos) for name in ("compile_seconds", "seconds"))
     executing = time.perf_counter() - begin - compiling - planning
     outputs.tell(f"compiling {compiling:.1f} s, planning {planning:.1f} s, executing {executing:.1f} s")

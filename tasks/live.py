@@ -326,10 +326,12 @@ class Live:
             return
         infos, interval = [plan.info for plan in plans], self.planners(settings).interval
         replan_ms = 1e3 * np.array([info.seconds for info in infos][1:] or [infos[0].seconds])
+        feedbacks = [plan.feedback.seconds for plan in plans if plan.feedback is not None]
         failed = sum(info.candidates - info.finite for info in infos)
         lines = [
             f"- plans: first {infos[0].seconds:.2f} s; again {np.quantile(replan_ms, 0.5):.0f} ms (p50), "
             f"{np.quantile(replan_ms, 0.99):.0f} ms (p99), every {1e3 * dt * interval:.0f} ms",
+            *(f"- feedback: {seconds:.2f} s, once" for seconds in feedbacks[:1]),
             f"- candidates lost: {failed} of {sum(info.candidates for info in infos)}",
         ]
         if self.errors:

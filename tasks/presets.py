@@ -14,6 +14,8 @@ from mpc import CEM, MPPI, Dynamics, Fallback, GaussNewton, Gradient, Optimizer
 
 # Time of a replan, as a share of the first plan's, where a budget is given.
 REPLAN_SHARE = 0.2
+# Largest share of a budget that feedback may take.
+FEEDBACK_SHARE = 0.5
 # Candidates of the smallest round.
 LEAST = 8
 STEPS = GaussNewton(rounds=2, directions=24)
@@ -35,7 +37,9 @@ class Preset:
 
     verify: rounds of validation in the ground truth of the first plan and of each replan, at most; 0 for none. correct:
     the optimiser that searches on between two rounds. candidates: validated in a round. tolerance: a miss in the ground
-    truth that ends the rounds [m]. recovery: optimisers of the plans that keep the human up after the kick.
+    truth that ends the rounds [m]. recovery: optimisers of the plans that keep the human up after the kick. feedback:
+    whether joint targets answer deviations from the plan in every step, see `mpc.feedback`; only where the model has
+    derivatives.
     """
 
     first: Stage
@@ -46,26 +50,33 @@ class Preset:
     candidates: int = 1
     tolerance: float = 0.004
     recovery: Stage = (RECOVERY,)
+    feedback: bool = False
 
     def __post_init__(self) -> None:
         for name in ("interval", "candidates"):
             if not (_is_integer(value := getattr(self, name)) and value >= 1):
                 raise InputError(f"{name} is {value!r}, but must be an integer of at least 1")
+        for name in ("first", "replan", "recovery"):
+            _check_stage(name, getattr(self, name))
+        if not isinstance(self.feedback, bool):
+            raise InputError(f"feedback is {self.feedback!r}, but must be True or False")
         pair = self.verify
         if not (isinstance(pair, tuple) and len(pair) == 2 and all(_is_integer(n) and n >= 0 for n in pair)):
             raise InputError(f"verify is {pair!r}, but must be two integers of at least 0, of first plan and replans")
         if not (isinstance(self.tolerance, int | float) and 0.0 <= self.tolerance < math.inf):
             raise InputError(f"tolerance is {self.tolerance!r}, but must be a finite number of at least 0 [m]")
-        for name in ("first", "replan", "recovery"):
-            stage = getattr(self, name)
-            if not (isinstance(stage, tuple) and stage):
-                raise InputError(f"{name} is {stage!r}, but must be a tuple of at least one optimiser")
-            for optimizer in stage:
-                if not isinstance(optimizer, Optimizer):
-                    raise InputError(f"{name} holds {optimizer!r}, which is no optimiser: see mpc.Optimizer")
-                if not _hashable(optimizer):
-                    kind = type(optimizer).__name__
-                    raise InputError(f"{name} holds a {kind} that cannot be hashed: make it a frozen dataclass")
+
+
+def _check_stage(name: str, stage: object) -> None:
+    """Raise InputError if a field of a preset is not a tuple of optimisers that can be compared."""
+    if not (isinstance(stage, tuple) and stage):
+        raise InputError(f"{name} is {stage!r}, but must be a tuple of at least one optimiser")
+    for optimizer in stage:
+        if not isinstance(optimizer, Optimizer):
+            raise InputError(f"{name} holds {optimizer!r}, which is no optimiser: see mpc.Optimizer")
+        if not _hashable(optimizer):
+            kind = type(optimizer).__name__
+            raise InputError(f"{name} holds a {kind} that cannot be hashed: make it a frozen dataclass")
 
 
 def _hashable(value: object) -> bool:
@@ -96,8 +107,8 @@ def _first_stage(rounds: int, *searches_rounds: int) -> Stage:
 # over 64 others worse.
 PresetName = Literal["fast", "balanced", "accurate"]
 PRESETS: dict[str, Preset] = {
-    "fast": Preset(_first_stage(4, 8), REPLAN, interval=5, recovery=(replace(RECOVERY, rounds=1),)),
-    "balanced": Preset(_first_stage(16, 16, 64), REPLAN, interval=1),
+    "fast": Preset(_first_stage(4, 8), REPLAN, interval=8, recovery=(replace(RECOVERY, rounds=1),), feedback=True),
+    "balanced": Preset(_first_stage(16, 16, 64), REPLAN, interval=4, feedback=True),
     "accurate": Preset(_first_stage(16, 16, 64), REPLAN, interval=5, verify=(8, 3)),
 }
 
@@ -143,31 +154,39 @@ def _changed(part: Any, path: Sequence[str], value: Any, change: str) -> Any:
 
 
 class Seconds(NamedTuple):
-    """Times that plans take without compilation [s]: the first one, a replan, and one that keeps the human up."""
+    """Times that plans take without compilation [s]: the first one, a replan, and one that keeps the human up.
+
+    feedback: of its computation after the first plan, 0 where the preset has none.
+    """
 
     first: float
     replan: float
     recovery: float
+    feedback: float = 0.0
 
 
 def within(preset: Preset, seconds: float, measure: Callable[[Preset], Seconds]) -> Preset:
     """Return the preset with as many candidates as its first plan can evaluate in `seconds`, each replan in a fifth.
 
-    The plans that keep the human up do not take longer than replans either, and optimisers that run only where a plan
+    The time of the first plan includes its feedback, which is left out where it would take more than half of it. The
+    plans that keep the human up do not take longer than replans either, and optimisers that run only where a plan
     failed to converge are left out. measure: returns the times that a preset's plans take.
     """
     if not (math.isfinite(seconds) and seconds > 0.0):
         raise InputError(f"budget is {seconds}, but must be a finite number of seconds > 0")
     preset = replace(preset, first=_without_fallbacks(preset.first), replan=_without_fallbacks(preset.replan))
+    if preset.feedback and measure(preset).feedback > FEEDBACK_SHARE * seconds:
+        preset = replace(preset, feedback=False)
     fitting, factors = preset, Seconds(1.0, 1.0, 1.0)
     least = scaled(preset, Seconds(0.0, 0.0, 0.0))
     for _ in range(3):
         times = measure(fitting)
-        if fitting == least and times.first > seconds:
-            raise InputError(f"budget is {seconds:g} s, but the least that this preset needs is {times.first:.2g} s")
+        total = times.first + times.feedback
+        if fitting == least and total > seconds:
+            raise InputError(f"budget is {seconds:g} s, but the least that this preset needs is {total:.2g} s")
         replan = REPLAN_SHARE * seconds
         factors = Seconds(
-            factors.first * seconds / times.first,
+            factors.first * max(seconds - times.feedback, 0.0) / times.first,
             factors.replan * replan / times.replan,
             min(1.0, factors.recovery * replan / times.recovery),
         )

@@ -54,6 +54,7 @@ def summary_of(task: Task, execution: Execution, goal: Any) -> dict[str, Any]:
     deviation = np.linalg.norm((links - links[:, :1]) - (reference - reference[:, :1]), axis=-1)
     seconds = [plan.info.seconds for plan in plans]
     replan_ms = 1e3 * np.array(seconds[1:] or seconds)
+    feedbacks = [plan.feedback for plan in execution.plans if plan.feedback is not None]
     return {
         "target": jax.tree.map(lambda leaf: np.asarray(leaf, float).tolist(), goal),
         "truth_error_m": truth_error,
@@ -68,7 +69,11 @@ def summary_of(task: Task, execution: Execution, goal: Any) -> dict[str, Any]:
         "fell": bool((states[:end, 0, 2] < 0.5 * task.standing_height).any()),
         "plan_seconds": float(seconds[0]),
         "replan_ms": {"p50": float(np.quantile(replan_ms, 0.5)), "p99": float(np.quantile(replan_ms, 0.99))},
-        "compile_seconds": float(sum(plan.info.compile_seconds for plan in execution.plans)),
+        "feedback_seconds": float(sum(feedback.seconds for feedback in feedbacks)),
+        "compile_seconds": float(
+            sum(plan.info.compile_seconds for plan in execution.plans)
+            + sum(feedback.compile_seconds for feedback in feedbacks)
+        ),
         "candidates_lost": sum(plan.info.candidates - plan.info.finite for plan in execution.plans),
         "truth_rollouts": sum(plan.info.verified for plan in plans),
     }

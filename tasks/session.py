@@ -13,6 +13,7 @@ from jax.typing import ArrayLike
 
 from larp_model.engines.mujoco import SUBSTEPS, Truth
 from mpc import Dynamics, Optimizer, Planner, Verified, Window
+from mpc.dynamics import linearizable
 from mpc.loop import Execution, Phase, World, execute
 from tasks.models import NO_WEIGHTS, DynamicsName, models_of
 from tasks.presets import PRESETS, Preset, PresetName, Seconds, preset_of, usable, within
@@ -27,12 +28,16 @@ RECOVERY_INTERVAL, RECOVERY, STANDING_INTERVAL = 4, 70, 12
 
 
 class Planners(NamedTuple):
-    """Planners of the first plan, of later ones, every `interval` steps, and of the recovery of balance afterwards."""
+    """Planners of the first plan, of later ones, every `interval` steps, and of the recovery of balance afterwards.
+
+    feedback: whether joint targets answer deviations from the plan, see `mpc.feedback`.
+    """
 
     first: Planner
     replan: Planner
     interval: int
     recovery: Planner
+    feedback: bool = False
 
 
 class Session:
@@ -96,7 +101,9 @@ class Session:
                         stages[stage] = (*stages[stage], verified)
             first, replan = (self._planner.using(usable(self.models.scene, stage)) for stage in stages)
             recovery = self._recovery.using(usable(self.models.human, preset.recovery))
-            self._planners[preset] = Planners(first, replan, preset.interval, recovery)
+            self._planners[preset] = Planners(
+                first, replan, preset.interval, recovery, preset.feedback and linearizable(self.models.scene)
+            )
         return self._planners[preset]
 
     def within(self, preset: Preset, budget: float, goal: Any) -> Preset:
@@ -114,7 +121,12 @@ class Session:
         ):
             plan, state = planner.init(jax.random.key(0)), self.task.start()[links]
             seconds.append(min(planner.step(plan, state, ahead)[1].seconds for _ in range(2)))
-        return Seconds(*seconds)
+        times = Seconds(*seconds)
+        if not planners.feedback:
+            return times
+        plan, info = planners.first.step(planners.first.init(jax.random.key(0)), self.task.start(), window)
+        timed = (planners.first.feedback(plan, info, self.task.start(), window)[1].seconds for _ in range(2))
+        return times._replace(feedback=min(timed))
 
     def execute(
         self,
@@ -139,12 +151,12 @@ class Session:
         state = task.start() if state is None else task.check_state(state)
         steps = strike + 20 + AFTER_CONTACT if steps is None else steps
         free = task.untouched(state, steps)
-        first, replan, interval, recovery = planners
+        first, replan, interval, recovery, feedback = planners
 
         def is_done(step: int, state: np.ndarray) -> bool:
             return task.is_done(step, state, free[step])
 
-        phases = [Phase(first, replan, interval, window or task.window(goal), is_done, HOLD_STEPS)]
+        phases = [Phase(first, replan, interval, window or task.window(goal), is_done, HOLD_STEPS, feedback=feedback)]
         if recovers:
             ahead, end = self._standing.window, strike + RECOVERY
             phases += [

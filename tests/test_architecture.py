@@ -60,6 +60,7 @@ ORDER = [
     "larp_model",
     "larp_model.commands",
     "mpc.dynamics",
+    "mpc.feedback",
     "mpc.spline",
     "mpc.cost",
     "mpc.search",

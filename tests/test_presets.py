@@ -44,6 +44,20 @@ def test_a_preset_within_a_time_takes_that_time(seconds: float) -> None:
     assert found.recovery <= 0.22 * seconds
 
 
+def test_the_first_plan_and_its_feedback_share_a_time_and_feedback_takes_no_more_than_half_of_it() -> None:
+    def measure(preset: Preset) -> Seconds:
+        first, replan, recovery = (
+            0.01 + 2e-3 * candidates(each) for each in (preset.first, preset.replan, preset.recovery)
+        )
+        return Seconds(first, replan, recovery, 0.2 if preset.feedback else 0.0)
+
+    for seconds, has_feedback in ((0.3, False), (0.5, True), (2.0, True)):
+        fitting = within(PRESETS["balanced"], seconds, measure)
+        assert fitting.feedback == has_feedback
+        found = measure(fitting)
+        assert found.first + found.feedback == pytest.approx(seconds, rel=0.1)
+
+
 @pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_budget_that_is_no_time_is_refused(seconds: float) -> None:
     with pytest.raises(InputError, match="budget"):
@@ -74,7 +88,7 @@ def test_any_field_of_a_preset_can_be_changed_by_its_name() -> None:
     [
         ("interval", "must be NAME=VALUE"),
         ("interval=often", "must be NAME=VALUE"),
-        ("interval=2.5", "what it changes is 5"),
+        ("interval=2.5", "what it changes is 8"),
         ("intervl=2", "did you mean 'interval'"),
         ("every=2", "every is called interval now"),
         ("again.0.rounds=3", "again is called replan now"),
@@ -122,3 +136,8 @@ def test_an_optimiser_that_cannot_be_compared_is_refused_by_name() -> None:
 
     with pytest.raises(InputError, match="first holds a Mine that cannot be hashed: make it a frozen dataclass"):
         replace(PRESETS["fast"], first=(Mine(),))
+
+
+def test_feedback_that_is_neither_on_nor_off_is_refused_by_name() -> None:
+    with pytest.raises(InputError, match="feedback is 1, but must be True or False"):
+        replace(PRESETS["fast"], feedback=1)  # type: ignore[arg-type]

@@ -131,6 +131,7 @@ def figures_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "falls": int(sum(row["fell"] for row in rows)),
         "mean_plan_seconds": float(np.mean([row["plan_seconds"] for row in rows])),
         "replan_ms": {"p50": float(np.median(replan_medians)), "p99": float(replan_p99.max())},
+        "mean_feedback_seconds": float(np.mean([row["feedback_seconds"] for row in rows])),
         "compile_seconds": float(sum(row["compile_seconds"] for row in rows)),
         "truth_rollouts": int(sum(row["truth_rollouts"] for row in rows)),
     }
@@ -294,6 +295,7 @@ def table_of(figures: dict[str, Any], settings: KickSettings) -> Table:
         ("ball touched", f"{figures['touched']} of {settings.targets}"),
         ("fell within 2 s", f"{figures['falls']} of {settings.targets}"),
         ("first plan", f"{figures['mean_plan_seconds']:.2f} s"),
+        ("feedback, once", f"{figures['mean_feedback_seconds']:.2f} s"),
         ("replan, p50 and p99", f"{figures['replan_ms']['p50']:.0f} ms, {figures['replan_ms']['p99']:.0f} ms"),
         ("compilation, where the cache did not have it", f"{figures['compile_seconds']:.0f} s"),
         ("truth rollouts asked for by the planner", str(figures["truth_rollouts"])),

@@ -56,15 +56,16 @@ class Point:
 
     @property
     def name(self) -> str:
-        """Return a name: model, optimisers of first plan and replans, steps between replans, validation."""
+        """Return a name: model, optimisers of first plan and replans, steps between replans, feedback, validation."""
         preset = self.preset
         model = "larp" if self.dynamics == "larp" else f"mujoco {self.substeps}"
-        validation = ""
+        feedback, validation = ", feedback" if preset.feedback else "", ""
         if any(preset.verify):
             validation = ", trials {} / {} of {} to {:g} mm by {}".format(
                 *preset.verify, preset.candidates, 1e3 * preset.tolerance, _text_of((preset.correct,))
             )
-        return f"{model}: {_text_of(preset.first)} / {_text_of(preset.replan)} every {preset.interval}{validation}"
+        stages = f"{_text_of(preset.first)} / {_text_of(preset.replan)} every {preset.interval}"
+        return f"{model}: {stages}{feedback}{validation}"
 
 
 def _text_of(stage: Sequence[Optimizer]) -> str:
@@ -98,17 +99,19 @@ def cem(samples: int, rounds: int, elites: int) -> CEM:
 
 def points() -> tuple[Point, ...]:
     """Return the points to measure: the presets and variations around them, each once."""
-    variations = (*_sampling(), *_gauss_newton(), *_replans(), *_combinations(), *_validated(), *_mujoco())
+    families = _sampling, _gauss_newton, _replans, _feedback, _combinations, _validated, _mujoco
+    variations = (point for family in families for point in family())
     return tuple(dict.fromkeys((*map(Point, PRESETS.values()), *variations)))
 
 
 # Optimisers that several points share.
+NEVER = 1000  # steps between replans, longer than a kick
 ONCE, TWICE, SIX = GaussNewton(rounds=1), GaussNewton(rounds=2), GaussNewton(rounds=6)
 FEW = cem(16, 5, 8)
 
 
-def _larp(*first: Optimizer, replan: Optimizer = ONCE, interval: int = 5, **validation: Any) -> Point:
-    return Point(Preset(first, (replan,), interval, **validation))
+def _larp(*first: Optimizer, replan: Optimizer = ONCE, interval: int = 5, **fields: Any) -> Point:
+    return Point(Preset(first, (replan,), interval, **fields))
 
 
 def _sampling() -> Iterator[Point]:
@@ -138,6 +141,14 @@ def _replans() -> Iterator[Point]:
         yield _larp(SIX, interval=interval)
     for replan in (TWICE, GaussNewton(rounds=4), FEW):
         yield _larp(SIX, replan=replan)
+
+
+def _feedback() -> Iterator[Point]:
+    """Yield points with feedback, of other steps between replans, and of other first plans."""
+    for interval in (1, 2, 5, 8, 16, NEVER):
+        yield _larp(SIX, interval=interval, feedback=True)
+    for first in (TWICE, GaussNewton(rounds=4), GaussNewton(rounds=12)):
+        yield _larp(first, interval=8, feedback=True)
 
 
 def _combinations() -> Iterator[Point]:
@@ -176,8 +187,9 @@ def measure(kick: Kick, point: Point, weights: Path | None, targets: int, seed: 
         steps = kick.reference.strike + BEYOND + FLIGHT
         execution = session.execute(planners, target, seed + index, kick.start(shift), steps, recovers=False)
         plans = [plan.info for plan in plans_of(execution)]
-        spent = sum(info.seconds for info in plans)
-        kicks.append(summary_of(kick, execution, target) | {"planning_seconds": spent, "first_cost": plans[0].cost})
+        figures = summary_of(kick, execution, target)
+        spent = sum(info.seconds for info in plans) + figures["feedback_seconds"]
+        kicks.append(figures | {"planning_seconds": spent, "first_cost": plans[0].cost})
     jax.clear_caches()  # the next point compiles other programs, and each occupies memory
     errors = np.array([kick_figures["truth_error_m"] for kick_figures in kicks])
     return {
