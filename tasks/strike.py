@@ -10,6 +10,8 @@ from larp_model.scene import Scene
 
 # The ball has been struck when its velocity differs by more than this from the untouched ball's [m/s].
 STRUCK = 0.3
+# Before the reference strikes, a smaller difference is a graze, after which the strike is still to come [m/s].
+GRAZED = 1.0
 
 
 def untouched(scene: Scene, state: np.ndarray, steps: int, substeps: int = FINE_SUBSTEPS) -> np.ndarray:
@@ -23,10 +25,13 @@ def untouched(scene: Scene, state: np.ndarray, steps: int, substeps: int = FINE_
     return np.concatenate([ball[0], after[0][:, 0]])
 
 
-def is_struck(ball: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Return a mask (*) of the states (*, 13) of the ball after the strike. free: (*, 13), see `untouched`."""
+def is_struck(ball: np.ndarray, free: np.ndarray, least: float = STRUCK) -> np.ndarray:
+    """Return a mask (*) of the states (*, 13) of the ball after the strike.
+
+    free: (*, 13), see `untouched`. least: difference of velocities from there on [m/s].
+    """
     apart = ball[..., packed.VELOCITY] - free[..., packed.VELOCITY]
-    mask: np.ndarray = np.linalg.norm(apart, axis=-1) > STRUCK
+    mask: np.ndarray = np.linalg.norm(apart, axis=-1) > least
     return mask
 
 

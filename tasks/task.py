@@ -141,11 +141,12 @@ class Task(ABC):
         return {}
 
     def is_done(self, step: int, state: np.ndarray, free: np.ndarray) -> bool:
-        """Return whether the task is over in a state (L, 13) of a step, here that the ball has been struck.
+        """Return whether the task is over in a state (L, 13) of a step, here that the ball has been struck, not grazed.
 
         free: (13,), the untouched ball's state in that step.
         """
-        return bool(strike.is_struck(state[self.ball], free))
+        least = strike.STRUCK if step >= self.reference.strike else strike.GRAZED
+        return bool(strike.is_struck(state[self.ball], free, least))
 
     def title(self, goal: Any) -> str:
         """Return the title of a run in a few words."""

@@ -101,6 +101,14 @@ def test_a_prediction_that_turns_the_ball_is_reported_with_its_angle(task: kick.
     assert found["launch_error"] > 0.1
 
 
+def test_a_graze_before_the_reference_strikes_does_not_end_the_kick(task: kick.Kick) -> None:
+    strike, still = task.reference.strike, task.start()
+    for step, speed, is_over in ((5, 0.5, False), (5, 2.0, True), (strike, 0.5, True), (strike, 0.0, False)):
+        state = still.copy()
+        state[task.ball, 7] = speed
+        assert task.is_done(step, state, still[task.ball]) == is_over
+
+
 def test_a_ball_that_nothing_touches_has_no_events(task: kick.Kick) -> None:
     states = np.repeat(task.reference.states[:1], 20, axis=0)
     assert strike_step(states, at_rest(task, 20)) is None
