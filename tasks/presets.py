@@ -108,7 +108,7 @@ def _first_stage(rounds: int, *searches_rounds: int) -> Stage:
 PresetName = Literal["fast", "balanced", "accurate"]
 PRESETS: dict[str, Preset] = {
     "fast": Preset(_first_stage(4, 8), REPLAN, interval=8, recovery=(replace(RECOVERY, rounds=1),), feedback=True),
-    "balanced": Preset(_first_stage(16, 16, 64), REPLAN, interval=4, feedback=True),
+    "balanced": Preset(_first_stage(16, 16, 64), REPLAN, interval=8, feedback=True),
     "accurate": Preset(_first_stage(16, 16, 64), REPLAN, interval=5, verify=(8, 3)),
 }
 
