@@ -4,6 +4,7 @@ from mpc.cem import CEM
 from mpc.cost import CostTerm, absolute, evaluate, l2, nearest_on_path, quadratic
 from mpc.dynamics import Continued, Dynamics, MujocoDynamics
 from mpc.fallback import Fallback
+from mpc.feedback import Feedback
 from mpc.gauss_newton import GaussNewton
 from mpc.gradient import Gradient
 from mpc.mppi import MPPI
@@ -19,6 +20,7 @@ __all__ = [
     "CostTerm",
     "Dynamics",
     "Fallback",
+    "Feedback",
     "GaussNewton",
     "Gradient",
     "MujocoDynamics",

@@ -103,8 +103,8 @@ class Equations:
             return residuals(self.terms, continued(dynamics, states[None])[0], controls, inputs.context)
 
         controls = self.controls(knots, inputs.reference)
-        touched = curvatures(self.terms, residuals_of(states[1:], controls), inputs.weights)
-        problem = linear_quadratic(of_steps(dynamics), residuals_of, touched, states, controls)
+        curvature = curvatures(self.terms, residuals_of(states[1:], controls), inputs.weights)
+        problem = linear_quadratic(of_steps(dynamics), residuals_of, curvature, states, controls)
         if inputs.steps is None:
             return problem
         computed = (jnp.arange(len(controls)) < inputs.steps)[:, None, None]
