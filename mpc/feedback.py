@@ -133,32 +133,35 @@ def linear_quadratic(
     by_state, by_control = dynamics.linearize(states[:-1], controls)
     basis = dynamics.basis(after)
     count, inputs = by_control.shape[1:]
-    is_of_steps = {name: values.shape[:1] == (horizon,) and values.ndim == 2 for name, values in curvatures.items()}
+    names = {True: list[str](), False: list[str]()}
+    for name, values in curvatures.items():
+        names[values.ndim == 2 and len(values) == horizon].append(name)
 
-    def of_steps(states: jax.Array, controls: jax.Array) -> jax.Array:
-        values = residuals_of(states, controls)
-        return jnp.concatenate([jnp.zeros((horizon, 0)), *(values[name] for name in values if is_of_steps[name])], 1)
+    def by_step(values: dict[str, jax.Array]) -> jax.Array:
+        """Return the values (H, R) of residuals that depend on one step each."""
+        return jnp.concatenate([jnp.zeros((horizon, 0)), *(values[name] for name in names[True])], axis=1)
 
-    def of_sums(states: jax.Array, controls: jax.Array) -> jax.Array:
-        values = residuals_of(states, controls)
-        return jnp.concatenate([jnp.zeros(0), *(values[name].ravel() for name in values if not is_of_steps[name])])
+    def in_sums(values: dict[str, jax.Array]) -> jax.Array:
+        """Return the values (r,) of all other residuals."""
+        return jnp.concatenate([jnp.zeros(0), *(values[name].ravel() for name in names[False])])
 
     def step_slope(direction: jax.Array) -> jax.Array:
         """Return the derivative (H, R) along the same direction (n + m,) in all steps."""
         control_change = jnp.broadcast_to(direction[count:].reshape(controls.shape[1:]), controls.shape)
-        slope: jax.Array = jax.jvp(of_steps, (after, controls), (basis @ direction[:count], control_change))[1]
+        changes = basis @ direction[:count], control_change
+        slope: jax.Array = jax.jvp(lambda *steps: by_step(residuals_of(*steps)), (after, controls), changes)[1]
         return slope
 
     slopes = jax.vmap(step_slope, out_axes=-1)(jnp.eye(count + inputs))
-    weights = jnp.concatenate([jnp.zeros((horizon, 0)), *(c for name, c in curvatures.items() if is_of_steps[name])], 1)
-    sum_by_states, sum_by_controls = jax.jacrev(of_sums, (0, 1))(after, controls)
+    sum_slopes = jax.jacrev(lambda *steps: in_sums(residuals_of(*steps)), (0, 1))
+    sum_by_states, sum_by_controls = sum_slopes(after, controls)
     return LinearQuadratic(
         by_state,
         by_control,
-        jnp.einsum("hr,hri,hrj->hij", weights, slopes, slopes),
+        jnp.einsum("hr,hri,hrj->hij", by_step(curvatures), slopes, slopes),
         jnp.einsum("rhlc,hlcn->hrn", sum_by_states, basis),
         jnp.moveaxis(sum_by_controls.reshape(-1, horizon, inputs), 0, 1),
-        jnp.concatenate([jnp.zeros(0), *(c.ravel() for name, c in curvatures.items() if not is_of_steps[name])]),
+        in_sums(curvatures),
     )
 
 

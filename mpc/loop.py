@@ -96,7 +96,7 @@ class Checkpoint(NamedTuple):
 
 
 @dataclass
-class Followed:
+class ActivePlan:
     """A plan that is being executed: joint targets (H, J, 3) [rad] from a step on, and feedback around it, if any.
 
     sums: see `feedback.Feedback`.
@@ -120,23 +120,23 @@ class Followed:
         return control
 
 
-def follow(
-    phase: Phase, index: int, step: int, state: np.ndarray, last: Followed | None, key: jax.Array
-) -> tuple[Followed, PlanRecord]:
+def next_plan(
+    phase: Phase, index: int, step: int, state: np.ndarray, last: ActivePlan | None, key: jax.Array
+) -> tuple[ActivePlan, PlanRecord]:
     """Return a plan that a phase, the `index`-th, makes in a state (L, 13) of a step, after its last one, if any."""
     planner, window = phase.first if last is None else phase.replan, phase.window(step)
     warm_start = planner.init(jax.random.fold_in(key, index), window.time) if last is None else last.plan
     plan, info = planner.step(warm_start, state, window)
-    followed = Followed(plan, step, np.asarray(planner.controls(plan, window.reference)))
+    active = ActivePlan(plan, step, np.asarray(planner.controls(plan, window.reference)))
     feedback_info = None
     if phase.feedback:
         if last is None or last.feedback is None:
-            followed.feedback, feedback_info = planner.feedback(plan, info, state, window)
+            active.feedback, feedback_info = planner.feedback(plan, info, state, window)
         else:
             predicted = planner.predicted(info, state, window)
-            followed.feedback = last.feedback.around(followed.controls, predicted, step - last.step)
-        followed.sums = followed.feedback.init()
-    return followed, PlanRecord(step, index, state, plan, info, feedback_info)
+            active.feedback = last.feedback.around(active.controls, predicted, step - last.step)
+        active.sums = active.feedback.init()
+    return active, PlanRecord(step, index, state, plan, info, feedback_info)
 
 
 def execute(
@@ -157,13 +157,13 @@ def execute(
     there on. Raises `DivergenceError` as soon as the world diverges.
     """
     execution, phase_index = Execution([np.asarray(state)]), 0
-    followed: Followed | None = None
+    active: ActivePlan | None = None
     end_step: int | None = None
     if checkpoint is not None:
         execution = Execution([*checkpoint.states], [*checkpoint.controls])
         phase_index, planner = checkpoint.phase, phases[checkpoint.phase].replan
         targets = planner.controls(checkpoint.plan, phases[phase_index].window(checkpoint.step).reference)
-        followed = Followed(checkpoint.plan, checkpoint.step, np.asarray(targets))
+        active = ActivePlan(checkpoint.plan, checkpoint.step, np.asarray(targets))
     world.reset(execution.states[-1][None])
     for step in range(len(execution.controls), steps):
         sensed = sense(execution.states[-1])
@@ -173,14 +173,14 @@ def execute(
             if end_step is None or step < end_step:
                 break
             if phases[phase_index + 1 :] and phases[phase_index + 1].first is not phases[phase_index].replan:
-                followed = None
+                active = None
             phase_index, end_step = phase_index + 1, None
         phase = phases[min(phase_index, len(phases) - 1)]
         planning, seen = phase_index < len(phases), sensed[phase.links]
-        if planning and (followed is None or (end_step is None and step - followed.step >= phase.interval)):
-            followed, record = follow(phase, phase_index, step, seen, followed, key)
+        if planning and (active is None or (end_step is None and step - active.step >= phase.interval)):
+            active, record = next_plan(phase, phase_index, step, seen, active, key)
             execution.plans.append(record._replace(state=sensed))
-        target = None if followed is None else followed.target(step, seen)
+        target = None if active is None else active.target(step, seen)
         control = np.asarray(phase.window(step).reference)[0] if target is None else target
         execution.controls.append(control)
         next_state = world.step(control[None])[0]

@@ -113,7 +113,7 @@ def test_damping_makes_gains_smaller() -> None:
 
 
 def test_the_quadratic_predicts_what_changes_of_start_and_controls_cost() -> None:
-    """Of a leg that swings: costs of each step, and one of the last state and of the mean control."""
+    """A swinging leg has costs of each step, and one of its last state and its mean control."""
     with jax.enable_x64(True):
         simulator, random, steps = Simulator.of_physics(Scene((LEG,))), np.random.default_rng(0), 4
         start = jnp.asarray(leg_state())
