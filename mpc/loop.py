@@ -1,14 +1,22 @@
-"""The closed loop in a world: plan, execute, shift. It records and draws nothing."""
+"""The closed loop in a world: plan, execute, shift. It records and draws nothing.
+
+A world waits for each plan, or goes on meanwhile (`realtime`): a plan then begins in the step in which it is expected,
+from the state that the planner's model predicts for it, and the plan before is executed until then.
+"""
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol
 
 import jax
 import numpy as np
 
+from larp_model import state as packed
+from larp_model.errors import InputError
 from mpc.feedback import Feedback, FeedbackInfo
 from mpc.planner import Plan, PlanInfo, Planner, Window
 
@@ -54,9 +62,12 @@ class Phase(NamedTuple):
 
 
 class PlanRecord(NamedTuple):
-    """A plan with its step and phase, the state (L, 13) that it began from, and its figures.
+    """A plan with the step that it begins in, its phase, the state (L, 13) that it began from, and its figures.
 
-    feedback: those of the feedback that was computed around it, if any.
+    feedback: figures of the feedback that was computed around it, if any. requested: the step in which it was asked
+    for, from where `state` was predicted. seconds: from then until it was finished, compilation left out. received: the
+    step from which it was executed. error: largest distance [m] of a link from that prediction in step `step`; NaN
+    where it was received later.
     """
 
     step: int
@@ -65,6 +76,10 @@ class PlanRecord(NamedTuple):
     plan: Plan
     info: PlanInfo
     feedback: FeedbackInfo | None = None
+    requested: int = 0
+    seconds: float = 0.0
+    received: int = 0
+    error: float = math.nan
 
 
 @dataclass
@@ -97,7 +112,7 @@ class Checkpoint(NamedTuple):
 
 @dataclass
 class ActivePlan:
-    """A plan that is being executed: joint targets (H, J, 3) [rad] from a step on, and feedback around it, if any.
+    """A plan to execute: joint targets (H, J, 3) [rad] from a step on, for `links`, and feedback around it, if any.
 
     sums: see `feedback.Feedback`.
     """
@@ -105,6 +120,7 @@ class ActivePlan:
     plan: Plan
     step: int
     controls: np.ndarray
+    links: slice
     feedback: Feedback | None = None
     sums: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
@@ -116,27 +132,188 @@ class ActivePlan:
         if self.feedback is None:
             control: np.ndarray = self.controls[number]
             return control
-        self.sums, control = self.feedback.step(self.sums, number, state)
+        self.sums, control = self.feedback.step(self.sums, number, state[self.links])
         return control
+
+
+PlanResult = tuple[ActivePlan, PlanRecord]
+
+
+class Latency(Protocol):
+    """Time that plans take while the world goes on. It makes one plan at a time."""
+
+    @property
+    def lead(self) -> int:
+        """Return the steps after which a plan that is requested now is expected."""
+
+    def submit(self, step: int, job: Callable[[], PlanResult]) -> None:
+        """Begin to make a plan that is requested in a step."""
+
+    def result(self, step: int) -> PlanResult | None:
+        """Return the plan once it is finished, once, else None. Raises the errors of making it."""
+
+    def close(self) -> None:
+        """End what still runs."""
+
+
+class NoLatency:
+    """The world waits for each plan."""
+
+    lead = 0
+
+    def submit(self, step: int, job: Callable[[], PlanResult]) -> None:
+        """See `Latency`."""
+        self._result = job()
+
+    def result(self, step: int) -> PlanResult | None:
+        """See `Latency`."""
+        return self._result
+
+    def close(self) -> None:
+        """See `Latency`."""
 
 
 def next_plan(
     phase: Phase, index: int, step: int, state: np.ndarray, last: ActivePlan | None, key: jax.Array
-) -> tuple[ActivePlan, PlanRecord]:
+) -> PlanResult:
     """Return a plan that a phase, the `index`-th, makes in a state (L, 13) of a step, after its last one, if any."""
     planner, window = phase.first if last is None else phase.replan, phase.window(step)
     warm_start = planner.init(jax.random.fold_in(key, index), window.time) if last is None else last.plan
-    plan, info = planner.step(warm_start, state, window)
-    active = ActivePlan(plan, step, np.asarray(planner.controls(plan, window.reference)))
+    seen = state[phase.links]
+    plan, info = planner.step(warm_start, seen, window)
+    active = ActivePlan(plan, step, np.asarray(planner.controls(plan, window.reference)), phase.links)
     feedback_info = None
     if phase.feedback:
         if last is None or last.feedback is None:
-            active.feedback, feedback_info = planner.feedback(plan, info, state, window)
+            active.feedback, feedback_info = planner.feedback(plan, info, seen, window)
         else:
-            predicted = planner.predicted(info, state, window)
+            predicted = planner.predicted(info, seen, window)
             active.feedback = last.feedback.around(active.controls, predicted, step - last.step)
         active.sums = active.feedback.init()
     return active, PlanRecord(step, index, state, plan, info, feedback_info)
+
+
+def target_of(plan: ActivePlan | None, phase: Phase, step: int, state: np.ndarray) -> np.ndarray:
+    """Return the joint targets (J, 3) [rad] of a step in a state (L, 13): a plan's, or after its end the reference."""
+    if plan is not None and (target := plan.target(step, state)) is not None:
+        return target
+    reference: np.ndarray = np.asarray(phase.window(step).reference)[0]
+    return reference
+
+
+def predicted_state(
+    planner: Planner, phase: Phase, active: ActivePlan | None, step: int, lead: int, state: np.ndarray
+) -> np.ndarray:
+    """Return the state (L, 13) that a planner of a phase predicts `lead` steps on, under the targets sent until then.
+
+    Targets that answer deviations are those along a first prediction, without feedback.
+    """
+    if not lead:
+        return state
+
+    def targets(states: np.ndarray, plan: ActivePlan | None) -> np.ndarray:
+        return np.stack([target_of(plan, phase, step + number, states[number]) for number in range(lead)])
+
+    def rolled_out(controls: np.ndarray) -> np.ndarray:
+        states = np.repeat(state[None], lead + 1, axis=0)
+        states[1:, phase.links] = planner.roll_out(state[phase.links], controls, phase.window(step))
+        return states
+
+    without_feedback = None if active is None else replace(active, feedback=None)
+    states = rolled_out(targets(np.repeat(state[None], lead, axis=0), without_feedback))
+    if active is not None and active.feedback is not None:
+        states = rolled_out(targets(states[:-1], replace(active)))
+    last: np.ndarray = states[-1]
+    return last
+
+
+@dataclass
+class _Loop:
+    """The state of an execution between its steps.
+
+    phase: the number of the current one; end_step: in which it ends, if that is known. last: the phase's last plan,
+    that the next one continues. active: the plan that is executed. upcoming: a plan that begins in a later step.
+    """
+
+    phases: Sequence[Phase]
+    key: jax.Array
+    latency: Latency
+    phase: int = 0
+    end_step: int | None = None
+    last: ActivePlan | None = None
+    active: ActivePlan | None = None
+    upcoming: PlanResult | None = None
+    in_flight: bool = False
+    first_valid: int = 0  # plans of earlier phases are outdated
+
+    def enter_phase(self, step: int, state: np.ndarray) -> None:
+        """Go on to the phase that a step belongs to."""
+        while self.phase < len(self.phases):
+            current = self.phases[self.phase]
+            if self.end_step is None and current.is_done(step, state):
+                self.end_step = step + current.hold_steps
+            if self.end_step is None or step < self.end_step:
+                break
+            following = self.phases[self.phase + 1 : self.phase + 2]
+            if following and following[0].first is not current.replan:
+                self.last, self.upcoming, self.first_valid = None, None, self.phase + 1
+            self.phase, self.end_step = self.phase + 1, None
+
+    def update(self, step: int, state: np.ndarray) -> list[PlanRecord]:
+        """Return the records of plans that begin to be executed in a step, and request the next one."""
+        before = self.receive(step, state)
+        self.request(step, state)
+        return [record for record in (before, self.receive(step, state)) if record is not None]
+
+    def request(self, step: int, state: np.ndarray) -> None:
+        """Request the next plan in a step, if it is due."""
+        if self.phase >= len(self.phases) or self.in_flight or self.upcoming is not None:
+            return
+        phase, index = self.phases[self.phase], self.phase
+        # Nothing is executed yet, and the world waits for the first plan.
+        latency: Latency = NoLatency() if self.active is None else self.latency
+        lead, last = min(latency.lead, phase.replan.horizon - 1), self.last
+        due = last is None or (self.end_step is None and step + lead - last.step >= phase.interval)
+        if not due:
+            return
+        active = None if self.active is None else replace(self.active)
+
+        def job() -> PlanResult:
+            planner, begin = phase.first if last is None else phase.replan, time.perf_counter()
+            compiled_before = planner.compile_seconds
+            start = predicted_state(planner, phase, active, step, lead, state)
+            plan, record = next_plan(phase, index, step + lead, start, last, self.key)
+            seconds = time.perf_counter() - begin - (planner.compile_seconds - compiled_before)
+            return plan, record._replace(requested=step, seconds=seconds)
+
+        latency.submit(step, job)
+        self.in_flight = True
+        if latency is not self.latency:
+            self.in_flight, self.upcoming = False, latency.result(step)
+
+    def receive(self, step: int, state: np.ndarray) -> PlanRecord | None:
+        """Return the record of the plan that begins to be executed in a step, if there is one."""
+        if self.in_flight and (result := self.latency.result(step)) is not None:
+            self.in_flight = False
+            self.upcoming = result if result[1].phase >= self.first_valid else None
+        if self.upcoming is None or self.upcoming[1].step > step:
+            return None
+        (plan, record), self.upcoming = self.upcoming, None
+        self.last = self.active = plan
+        record = record._replace(received=step)
+        if step > record.step:
+            return record
+        links = self.phases[record.phase].links
+        return record._replace(error=_largest_distance(state[links], record.state[links]))
+
+    def target(self, step: int, state: np.ndarray) -> np.ndarray:
+        """Return the joint targets (J, 3) [rad] of a step in a state (L, 13)."""
+        return target_of(self.active, self.phases[min(self.phase, len(self.phases) - 1)], step, state)
+
+
+def _largest_distance(state: np.ndarray, other: np.ndarray) -> float:
+    """Return the largest distance [m] of a link's centre in two states (L, 13)."""
+    return float(np.linalg.norm(state[:, packed.POSITION] - other[:, packed.POSITION], axis=1).max())
 
 
 def execute(
@@ -148,45 +325,44 @@ def execute(
     observe: Callable[[Execution], None] = lambda execution: None,
     sense: Callable[[np.ndarray], np.ndarray] = lambda state: state,
     checkpoint: Checkpoint | None = None,
+    latency: Latency | None = None,
 ) -> Execution:
     """Plan, execute and replan for `steps`, from a state (L, 13) on, one phase after the other.
 
     After the last phase its plan is executed and, after the plan's end, the task's reference. observe: called after
     every step. sense: returns the state that the planners get in a true state (L, 13); the same by default.
     checkpoint: to continue from, without feedback until the next plan; the plans in the result are then those from
-    there on. Raises `DivergenceError` as soon as the world diverges.
+    there on. latency: of all plans but the first, for which the world waits; none by default. Raises `DivergenceError`
+    as soon as the world diverges, and InputError where plans are expected to take longer than their horizon.
     """
-    execution, phase_index = Execution([np.asarray(state)]), 0
-    active: ActivePlan | None = None
-    end_step: int | None = None
+    latency = NoLatency() if latency is None else latency
+    if phases and latency.lead >= (horizon := min(phase.replan.horizon for phase in phases)):
+        raise InputError(f"latency: plans take {latency.lead} steps, needs fewer than the planners' horizon, {horizon}")
+    execution, loop = Execution([np.asarray(state)]), _Loop(phases, key, latency)
     if checkpoint is not None:
         execution = Execution([*checkpoint.states], [*checkpoint.controls])
-        phase_index, planner = checkpoint.phase, phases[checkpoint.phase].replan
-        targets = planner.controls(checkpoint.plan, phases[phase_index].window(checkpoint.step).reference)
-        active = ActivePlan(checkpoint.plan, checkpoint.step, np.asarray(targets))
+        loop.phase, phase = checkpoint.phase, phases[checkpoint.phase]
+        targets = phase.replan.controls(checkpoint.plan, phase.window(checkpoint.step).reference)
+        loop.last = ActivePlan(checkpoint.plan, checkpoint.step, np.asarray(targets), phase.links)
+        loop.active = loop.last
     world.reset(execution.states[-1][None])
-    for step in range(len(execution.controls), steps):
-        sensed = sense(execution.states[-1])
-        while phase_index < len(phases):
-            if end_step is None and phases[phase_index].is_done(step, sensed):
-                end_step = step + phases[phase_index].hold_steps
-            if end_step is None or step < end_step:
-                break
-            if phases[phase_index + 1 :] and phases[phase_index + 1].first is not phases[phase_index].replan:
-                active = None
-            phase_index, end_step = phase_index + 1, None
-        phase = phases[min(phase_index, len(phases) - 1)]
-        planning, seen = phase_index < len(phases), sensed[phase.links]
-        if planning and (active is None or (end_step is None and step - active.step >= phase.interval)):
-            active, record = next_plan(phase, phase_index, step, seen, active, key)
-            execution.plans.append(record._replace(state=sensed))
-        target = None if active is None else active.target(step, seen)
-        control = np.asarray(phase.window(step).reference)[0] if target is None else target
-        execution.controls.append(control)
-        next_state = world.step(control[None])[0]
-        if not np.isfinite(next_state).all():
-            cause = "" if np.isfinite(control).all() else ": the joint targets are not finite"
-            raise DivergenceError(f"the world diverged in step {step}{cause}")
-        execution.states.append(next_state)
-        observe(execution)
+    try:
+        for step in range(len(execution.controls), steps):
+            sensed = sense(execution.states[-1])
+            loop.enter_phase(step, sensed)
+            execution.plans += loop.update(step, sensed)
+            execution.controls.append(loop.target(step, sensed))
+            execution.states.append(_stepped(world, step, execution.controls[-1]))
+            observe(execution)
+    finally:
+        latency.close()
     return execution
+
+
+def _stepped(world: World, step: int, control: np.ndarray) -> np.ndarray:
+    """Return the world's state (L, 13) after a step under joint targets (J, 3) [rad]."""
+    state: np.ndarray = world.step(control[None])[0]
+    if not np.isfinite(state).all():
+        cause = "" if np.isfinite(control).all() else ": the joint targets are not finite"
+        raise DivergenceError(f"the world diverged in step {step}{cause}")
+    return state

@@ -159,7 +159,8 @@ class Planner:
         By the dynamics, the plan never costs more than the last plan shifted to the window's time. If no candidate is
         finite, that one is returned, at cost inf.
         """
-        inputs = self._inputs(plan, state, window)
+        self._check_warm_start(plan, window.time)
+        inputs = self._inputs(state, window)
         begin, compiled_before = time.perf_counter(), self._programs.seconds
         random = np.random.default_rng(plan.key)
         search = self._warm_start(plan, window.time - float(plan.start), random)
@@ -195,13 +196,18 @@ class Planner:
         _, info = self.step(self.init(jax.random.key(0), window.time), state, window)
         return info.compile_seconds
 
+    @property
+    def compile_seconds(self) -> float:
+        """Return the seconds that compiling took so far, of all planners that share its programs."""
+        return self._programs.seconds
+
     def fan(self, plan: Plan, state: ArrayLike, window: Window, count: int = 16) -> tuple[np.ndarray, np.ndarray]:
         """Return costs (N,) and states (N, H', L, 13) of candidates around a plan made in `state`, for display.
 
         Candidates are drawn with half the plan's spread, the same ones each time, and rolled out by programs of `step`.
         """
         noise = coloured_noise(np.random.default_rng(0), (count, *plan.knots.shape), COLOUR)
-        inputs = self._inputs(plan, state, window)
+        inputs = self._inputs(state, window)
         problem = PlannerProblem(self._equations, self._programs, inputs, plan.knots)
         return problem.for_display(plan.knots + 0.5 * plan.spread * noise)
 
@@ -209,6 +215,21 @@ class Planner:
         """Return joint targets (H, J, 3) [rad] of the plan, given the reference (H, J, 3) it was made around."""
         controls: jax.Array = _controls(self._equations, plan.knots, self._reference(reference))
         return controls
+
+    def roll_out(self, state: ArrayLike, controls: np.ndarray, window: Window) -> np.ndarray:
+        """Return the states (S, L, 13) after each of S <= H joint targets (S, J, 3) [rad], from a state (L, 13) on.
+
+        window: one that plans are made for; its context costs nothing here, but its shapes choose the program.
+        """
+        count = len(controls)
+        if not 1 <= count <= self.horizon:
+            raise InputError(f"controls: got {count}, needs 1 to horizon ({self.horizon})")
+        reference = np.concatenate([controls, np.repeat(controls[-1:], self.horizon - count, axis=0)])
+        steps = None if window.steps is None else count
+        inputs = self._inputs(state, window._replace(reference=reference, steps=steps))
+        knots = np.zeros((len(self.knot_times), *self.scale.shape), np.float32)
+        problem = PlannerProblem(self._equations, self._programs, inputs, knots)
+        return problem.for_display(knots[None])[1][0, :count]
 
     def predicted(self, info: PlanInfo, state: ArrayLike, window: Window) -> np.ndarray:
         """Return the states (S + 1, L, 13) of a plan made in `state` for a window, from there on, under control."""
@@ -221,7 +242,7 @@ class Planner:
         """
         if not linearizable(self.dynamics):
             raise InputError(f"dynamics: got {type(self.dynamics).__name__}, needs `linearize` for feedback")
-        inputs, states = self._inputs(plan, state, window), self.predicted(info, state, window)
+        inputs, states = self._inputs(state, window), self.predicted(info, state, window)
         begin, compiled_before = time.perf_counter(), self._programs.seconds
         rest = np.repeat(states[-1:], self.horizon + 1 - len(states), axis=0)
         function, arguments = program_of(self._equations.linear_quadratic, self.dynamics)
@@ -268,19 +289,22 @@ class Planner:
         spread = spread + self.reheat * np.maximum(self.scale - spread, 0.0)
         return Search(elites[0], spread, elites, np.full(self.elites, np.inf, np.float32), self.scale)
 
-    def _inputs(self, plan: Plan, state: ArrayLike, window: Window) -> Inputs:
+    def _check_warm_start(self, plan: Plan, now: float) -> None:
+        """Raise InputError for a plan of another problem, or of a later time than `now` [s]."""
+        knots = (len(self.knot_times), *self.scale.shape)
+        if plan.knots.shape != knots:
+            raise InputError(f"plan: got knots {plan.knots.shape}, needs {knots}; it is another problem's")
+        start = float(plan.start)  # of a clock in 32 bits, hence the tolerance
+        if not start - 1e-4 * max(1.0, abs(start)) <= now < np.inf:
+            raise InputError(f"window.time: got {now} s, needs a time from plan.start, {start} s, on")
+
+    def _inputs(self, state: ArrayLike, window: Window) -> Inputs:
         """Return the public arguments, checked, as arrays of fixed shape and type."""
         state = np.asarray(state, np.float32)
         if state.ndim != 2 or state.shape[1] != 13:
             raise InputError(f"state: got shape {state.shape}, needs (L, 13)")
         if not np.isfinite(state).all():
             raise InputError("state: got numbers that are not finite, needs all of them finite")
-        knots = (len(self.knot_times), *self.scale.shape)
-        if plan.knots.shape != knots:
-            raise InputError(f"plan: got knots {plan.knots.shape}, needs {knots}; it is another problem's")
-        start = float(plan.start)  # of a clock in 32 bits, hence the tolerance
-        if not start - 1e-4 * max(1.0, abs(start)) <= window.time < np.inf:
-            raise InputError(f"window.time: got {window.time} s, needs a time from plan.start, {start} s, on")
         if window.steps is not None and not 1 <= window.steps <= self.horizon:
             raise InputError(f"window.steps: got {window.steps}, needs 1 to horizon ({self.horizon})")
         weights = {term.name: float(term.weight) for term in self.terms}

@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 from larp_model.engines.mujoco import SUBSTEPS, Truth
 from mpc import Dynamics, Optimizer, Planner, Verified, Window
 from mpc.dynamics import linearizable
-from mpc.loop import Execution, Phase, World, execute
+from mpc.loop import Execution, Latency, Phase, World, execute
 from tasks.models import NO_WEIGHTS, DynamicsName, models_of
 from tasks.presets import PRESETS, Preset, PresetName, Seconds, preset_of, usable, within
 from tasks.run import AFTER_CONTACT, Run
@@ -140,12 +140,13 @@ class Session:
         recovers: bool = True,
         world: World | None = None,
         window: Callable[[int], Window] | None = None,
+        latency: Latency | None = None,
     ) -> Execution:
         """Plan and execute in the ground truth, from a state (the task's start by default), for `steps`.
 
         steps: by default until 20 + `AFTER_CONTACT` steps after the reference's strike. recovers: whether plans go on
         after the task is done, to keep the human up. world: to execute in instead. window: gives the planner's window
-        from a step on, if its goal is not always the same.
+        from a step on, if its goal is not always the same. latency: of plans, see `mpc.realtime`; none by default.
         """
         task, strike = self.task, self.task.reference.strike
         state = task.start() if state is None else task.check_state(state)
@@ -164,7 +165,7 @@ class Session:
                 Phase(recovery, recovery, STANDING_INTERVAL, ahead, links=task.human),
             ]
         world = world or Truth(task.scene, 1, task.substeps, threads=1)
-        return execute(world, state, phases, steps, jax.random.key(seed), observe, sense)
+        return execute(world, state, phases, steps, jax.random.key(seed), observe, sense, latency=latency)
 
     def run(
         self,
@@ -174,14 +175,18 @@ class Session:
         state: ArrayLike | None = None,
         observe: Callable[[Execution], None] = lambda execution: None,
         world: World | None = None,
+        latency: Latency | None = None,
     ) -> Run:
         """Plan for a goal and execute in MuJoCo, or in a world of your own.
 
         goal: of a kick, the target (3,) [m]. preset: its name, or one of your own. seed: of the planner's random
-        numbers. state: (L, 13) to begin in; see `Task.start`. observe: called after every step.
+        numbers. state: (L, 13) to begin in; see `Task.start`. observe: called after every step. latency: of plans, while
+        the world goes on, see `mpc.realtime`; by default the world waits for them.
         """
         goal = self.task.check(goal)
-        execution = self.execute(self.planners(preset), goal, seed, state, observe=observe, world=world)
+        execution = self.execute(
+            self.planners(preset), goal, seed, state, observe=observe, world=world, latency=latency
+        )
         name = preset if isinstance(preset, str) else type(preset).__name__
         weights = self.models.weights
         return Run.of(self.task, execution, goal, preset=name, dynamics=self.dynamics, weights=weights, seed=seed)

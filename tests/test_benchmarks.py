@@ -14,7 +14,7 @@ from rich.table import Table
 
 from larp_model.errors import InputError
 from mpc import CEM
-from tasks.benchmarks import compilation, kick, report
+from tasks.benchmarks import compilation, kick, realtime, report
 from tasks.presets import PRESETS, Preset
 
 
@@ -124,6 +124,30 @@ def test_the_kick_benchmark_keeps_its_rows_and_touches_no_results(
     (row,) = found["rows"]
     assert row["limit_error_m"] == found["mean_limit_error_m"] != row["truth_error_m"]
     assert report.RESULTS.read_text() == "# Results\n"
+
+
+@pytest.mark.slow
+def test_the_benchmark_of_real_time_delays_the_same_kicks_and_counts_missed_deadlines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    search = (CEM(samples=8, rounds=1, elites=2),)
+    monkeypatch.setitem(PRESETS, "fast", Preset(search, search, interval=10, recovery=search))
+    realtime.main(targets=1, delay=("0", "40"), dynamics=("mujoco",), substeps=4)
+    content = json.loads(Path("runs/benchmarks/realtime.json").read_text())
+    instant, delayed = content["points"]
+    assert instant["lead_ms"] == 0.0 and delayed["lead_ms"] == pytest.approx(40.0)
+    assert instant["deadlines_missed"] == delayed["deadlines_missed"] == 0
+    assert instant["prediction_error_m"] == 0.0 < delayed["prediction_error_m"] < 0.02
+    one, other = content["rows"]
+    assert one["target"] == other["target"] and one["truth_error_m"] != other["truth_error_m"]
+    assert Path("runs/benchmarks/realtime.png").is_file()
+
+
+@pytest.mark.parametrize("delay", ["-1", "soon", "nan", "inf"])
+def test_delays_that_are_none_are_refused(tmp_path: Path, delay: str) -> None:
+    with pytest.raises(InputError, match=f"delay is '{delay}', but must be measured, clock or a number of ms"):
+        realtime.main(delay=(delay,), json=tmp_path / "some.json")
 
 
 def test_many_bodies_have_neither_one_height_nor_one_budget(tmp_path: Path) -> None:

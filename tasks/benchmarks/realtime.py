@@ -1,0 +1,329 @@
+"""Kicks in a world that goes on while the planner plans: misses over delay and over the rate of replans."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from larp_model.engines.mujoco import SUBSTEPS, Truth
+from larp_model.errors import InputError
+from mpc.loop import Execution, Latency, World
+from mpc.realtime import PacedWorld, PlanningThread, SimulatedLatency
+from tasks.benchmarks import report
+from tasks.benchmarks.kick import figures_of
+from tasks.command import prepare_jax, run
+from tasks.kick import USUAL, Kick
+from tasks.models import DynamicsName
+from tasks.presets import PresetName, preset_of
+from tasks.run import plans_of, summary_of
+from tasks.sensing import noisy
+from tasks.session import Planners, Session
+from tasks.targets import random_kick, random_roll
+
+# Delays that are no number: drawn from what plans took before, and by the clock, with plans made in a thread.
+MEASURED, CLOCK = "measured", "clock"
+
+
+@dataclass(frozen=True)
+class RealtimeSettings:
+    """Settings of a run that its figures depend on; see the arguments of `main`."""
+
+    targets: int
+    seed: int
+    delay: tuple[str, ...]
+    preset: tuple[PresetName, ...]
+    dynamics: tuple[DynamicsName, ...]
+    interval: tuple[int, ...]
+    substeps: int
+    rolling: float
+    noise: bool
+
+    def check(self) -> None:
+        """Raise InputError if a setting is invalid."""
+        if self.targets < 1:
+            raise InputError(f"targets is {self.targets}, but must be at least 1")
+        for delay in self.delay:
+            if delay not in (MEASURED, CLOCK) and not _milliseconds(delay) >= 0.0:
+                raise InputError(f"delay is {delay!r}, but must be {MEASURED}, {CLOCK} or a number of ms of at least 0")
+        for interval in self.interval:
+            if interval < 1:
+                raise InputError(f"interval is {interval}, but must be at least 1")
+        if not (math.isfinite(self.rolling) and self.rolling >= 0.0):
+            raise InputError(f"rolling is {self.rolling}, but must be a finite speed of at least 0 m/s")
+
+    @property
+    def command(self) -> str:
+        """Return the command that repeats the run."""
+        parts = [
+            f"python -m tasks.benchmarks.realtime --targets {self.targets} --seed {self.seed}",
+            f"--delay {' '.join(self.delay)} --preset {' '.join(self.preset)} --dynamics {' '.join(self.dynamics)}",
+        ]
+        if self.interval:
+            parts.append(f"--interval {' '.join(map(str, self.interval))}")
+        if self.substeps != SUBSTEPS:
+            parts.append(f"--substeps {self.substeps}")
+        if self.rolling:
+            parts.append(f"--rolling {self.rolling:g}")
+        if self.noise:
+            parts.append("--noise")
+        return " ".join(parts)
+
+    def points(self) -> list[Point]:
+        """Return the points to measure, each once."""
+        return [
+            Point(preset, dynamics, interval, delay)
+            for dynamics in self.dynamics
+            for preset in self.preset
+            for interval in self.interval or (preset_of(preset).interval,)
+            for delay in self.delay
+        ]
+
+
+def _milliseconds(delay: str) -> float:
+    """Return a delay [ms]; NaN where it is no finite number."""
+    try:
+        value = float(delay)
+    except ValueError:
+        return math.nan
+    return value if math.isfinite(value) else math.nan
+
+
+class Point(NamedTuple):
+    """A planner's preset and model, steps between its replans, and the delay of its plans."""
+
+    preset: PresetName
+    dynamics: DynamicsName
+    interval: int
+    delay: str
+
+    @property
+    def planner(self) -> str:
+        """Return the planner as text."""
+        return f"{self.dynamics}, {self.preset}, every {self.interval}"
+
+    @property
+    def name(self) -> str:
+        """Return the point as text."""
+        return f"{self.planner}, {delay_text(self.delay)}"
+
+
+def delay_text(delay: str) -> str:
+    """Return a delay with its unit."""
+    return delay if delay in (MEASURED, CLOCK) else f"{delay} ms"
+
+
+class Sessions:
+    """Sessions of the kick, planners of points and times that their plans take, each made when first needed."""
+
+    def __init__(self, settings: RealtimeSettings) -> None:
+        """Begin with none."""
+        self.settings, self.kick = settings, Kick.standard()
+        self._sessions: dict[str, Session] = {}
+        self._seconds: dict[tuple[str, str, int], list[float]] = {}
+
+    def session(self, dynamics: DynamicsName) -> Session:
+        """Return the session of a model."""
+        if dynamics not in self._sessions:
+            self._sessions[dynamics] = Session(self.kick, dynamics, substeps=self.settings.substeps)
+        return self._sessions[dynamics]
+
+    def planners(self, point: Point) -> Planners:
+        """Return the planners of a point."""
+        preset = replace(preset_of(point.preset), interval=point.interval)
+        return self.session(point.dynamics).planners(preset)
+
+    def seconds(self, point: Point) -> list[float]:
+        """Return the times [s] that the plans of a kick took, after another kick that compiled all programs."""
+        key = point.dynamics, point.preset, point.interval
+        if key not in self._seconds:
+            for _ in range(2):
+                latency = SimulatedLatency(self.kick.scene.dt)
+                self.session(point.dynamics).execute(self.planners(point), np.array(USUAL), 0, latency=latency)
+            self._seconds[key] = latency.seconds
+        return self._seconds[key]
+
+    def timing(self, point: Point, seed: int) -> tuple[Latency, World]:
+        """Return the latency of a point's plans, and the world for it."""
+        dt, world = self.kick.scene.dt, Truth(self.kick.scene, 1, self.kick.substeps, threads=1)
+        seconds = self.seconds(point)
+        if point.delay == CLOCK:
+            return PlanningThread(dt, max(seconds)), PacedWorld(world, dt)
+        delays = seconds if point.delay == MEASURED else 1e-3 * float(point.delay)
+        return SimulatedLatency(dt, delays, seed), world
+
+
+def kick_row(
+    sessions: Sessions, point: Point, index: int, target: np.ndarray, shift: np.ndarray, roll: np.ndarray
+) -> report.Row:
+    """Return the row of a kick: its summary, and what plans made of the time. See `kick.kick_row` for arguments."""
+    settings, kick, seed = sessions.settings, sessions.kick, sessions.settings.seed + index
+    sense = noisy(kick.scene, np.random.default_rng((settings.seed, index))) if settings.noise else lambda state: state
+    latency, world = sessions.timing(point, seed)
+    execution = sessions.session(point.dynamics).execute(
+        sessions.planners(point), target, seed, kick.start(shift, roll), sense=sense, world=world, latency=latency
+    )
+    row = summary_of(kick, execution, target) | timing_figures(execution, kick.scene.dt)
+    return row | {
+        "point": point.name,
+        "overruns": world.overruns if isinstance(world, PacedWorld) else 0,
+        "seed": seed,
+        "halved_error_m": row["truth_error_m"],
+    }
+
+
+def timing_figures(execution: Execution, dt: float) -> dict[str, Any]:
+    """Return what the replans of an execution in steps of dt [s] made of the time.
+
+    replans: of the whole execution, and of them those missed their deadline: received after the step for which they
+    were made. replans_per_second, prediction_error_m (mean) and lead_ms (mean): of the task itself, without recovery.
+    """
+    replans, own = execution.plans[1:], plans_of(execution)[1:]
+    errors = [plan.error for plan in own if math.isfinite(plan.error)]
+    return {
+        "replans": len(replans),
+        "deadlines_missed": sum(plan.received > plan.step for plan in replans),
+        "replans_per_second": len(own) / (dt * own[-1].received) if own and own[-1].received else 0.0,
+        "prediction_error_m": float(np.mean(errors)) if errors else math.nan,
+        "lead_ms": float(1e3 * dt * np.mean([plan.step - plan.requested for plan in own])) if own else 0.0,
+    }
+
+
+def point_figures(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the figures of all kicks of a point."""
+    replans = sum(row["replans"] for row in rows)
+    return figures_of(rows) | {
+        "deadlines_missed": sum(row["deadlines_missed"] for row in rows),
+        "replans": replans,
+        "missed_share": sum(row["deadlines_missed"] for row in rows) / max(replans, 1),
+        "replans_per_second": float(np.mean([row["replans_per_second"] for row in rows])),
+        "prediction_error_m": float(np.nanmean([row["prediction_error_m"] for row in rows])),
+        "lead_ms": float(np.mean([row["lead_ms"] for row in rows])),
+        "p95_truth_error_m": float(np.quantile([row["truth_error_m"] for row in rows], 0.95)),
+        "overruns": sum(row["overruns"] for row in rows),
+    }
+
+
+def table_of(figures: dict[Point, dict[str, Any]], settings: RealtimeSettings) -> Table:
+    """Return a table with one line a point."""
+    columns = (
+        "planner",
+        "delay",
+        "replans a second",
+        "deadlines missed",
+        "prediction off by",
+        "mean",
+        "median",
+        "95 %",
+    )
+    table = Table(*columns, "fell", title=f"Real time, {settings.targets} targets")
+    for point, values in figures.items():
+        table.add_row(
+            point.planner,
+            delay_text(point.delay),
+            f"{values['replans_per_second']:.1f}",
+            f"{values['deadlines_missed']} of {values['replans']}",
+            f"{1e3 * values['prediction_error_m']:.1f} mm",
+            *(f"{1e2 * values[f'{which}_truth_error_m']:.1f} cm" for which in ("mean", "median", "p95")),
+            f"{values['falls']}",
+        )
+    return table
+
+
+def picture(figures: dict[Point, dict[str, Any]]) -> Figure:
+    """Plot misses over delay and over the rate of replans, a line for each planner."""
+    figure = Figure(figsize=(11, 4.5), layout="constrained")
+    over_delay, over_rate = figure.subplots(1, 2)
+    for planner in dict.fromkeys(point.planner for point in figures):
+        own = {point: value for point, value in figures.items() if point.planner == planner}
+        places = [
+            value["lead_ms"] if point.delay in (MEASURED, CLOCK) else float(point.delay) for point, value in own.items()
+        ]
+        order = np.argsort(places)
+        misses = np.array([100.0 * value["mean_truth_error_m"] for value in own.values()])
+        over_delay.plot(np.array(places)[order], misses[order], marker="o", label=planner)
+        for place, miss, point in zip(places, misses, own, strict=True):
+            if point.delay in (MEASURED, CLOCK):
+                over_delay.annotate(point.delay, (place, miss), (4, 4), textcoords="offset points", fontsize=8)
+        rates = [value["replans_per_second"] for value in own.values()]
+        over_rate.scatter(rates, misses)
+    for axes, label in ((over_delay, "delay [ms]"), (over_rate, "replans a second")):
+        axes.set(xlabel=label, ylabel="mean miss in MuJoCo [cm]", ylim=(0.0, None))
+        axes.grid(color="0.92")
+    over_delay.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def main(
+    targets: int = 32,
+    seed: int = 0,
+    delay: tuple[str, ...] = ("0", "10", "25", "50", "100", MEASURED, CLOCK),
+    preset: tuple[PresetName, ...] = ("fast",),
+    dynamics: tuple[DynamicsName, ...] = ("larp",),
+    interval: tuple[int, ...] = (),
+    substeps: int = SUBSTEPS,
+    rolling: float = 0.0,
+    noise: bool = False,
+    json: Path = Path("runs/benchmarks/realtime.json"),
+    publish: bool = False,
+) -> None:
+    """Plan and execute kicks to random targets in a world that does not wait for plans.
+
+    Args:
+        targets: how many kicks at each point.
+        seed: of targets, ball spots, delays and planner.
+        delay: of plans: in ms; measured: drawn from what plans took on this machine; clock: by the wall clock, with
+            plans made in a thread.
+        preset: fast, balanced or accurate.
+        dynamics: the planner's model: larp or mujoco.
+        interval: steps between replans at least; those of the preset by default.
+        substeps: engine steps in a step of MuJoCo as the model.
+        rolling: greatest speed [m/s] of a ball that comes from ahead or from the kicking side; 0: it rests.
+        noise: show the planner the state with sensing noise.
+        json: where the figures go; the picture goes beside them.
+        publish: put the table into RESULTS.md.
+    """
+    settings = RealtimeSettings(targets, seed, delay, preset, dynamics, interval, substeps, rolling, noise)
+    settings.check()
+    report.ready(json, publish)
+    prepare_jax()
+    points = settings.points()
+    rows = report.collect(json, settings.command, jobs_of(settings, points))
+    figures = {point: point_figures([row for row in rows if row["point"] == point.name]) for point in points}
+    content = {
+        "command": settings.command,
+        "hardware": report.hardware(),
+        "points": [{**point._asdict(), **values} for point, values in figures.items()],
+        "rows": rows,
+    }
+    report.write_json(json, content)
+    report.write_picture(json.with_suffix(".png"), picture(figures))
+    table = table_of(figures, settings)
+    report.show(table)
+    if publish:
+        report.publish("realtime", f"Real time, {targets} targets", settings.command, table)
+
+
+def jobs_of(settings: RealtimeSettings, points: list[Point]) -> dict[str, Callable[[], report.Row]]:
+    """Return the jobs that execute one kick each, by name: the same kicks at every point."""
+    sessions, random = Sessions(settings), np.random.default_rng(settings.seed)
+    kicks = []
+    for _ in range(settings.targets):
+        target, shift = random_kick(random)
+        kicks.append((target, shift, random_roll(random, settings.rolling) if settings.rolling else np.zeros(2)))
+    return {
+        f"{point.name}: kick {index}": partial(kick_row, sessions, point, index, *one)
+        for point in points
+        for index, one in enumerate(kicks)
+    }
+
+
+if __name__ == "__main__":
+    run(main)
