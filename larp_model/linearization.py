@@ -21,9 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from larp_model import rotation
 from larp_model import state as packed
-from larp_model.linalg import combined, cross, dot
-from larp_model.physics.kinematics import Anchors, kinematics, turned_anchors
+from larp_model.linalg import combined, cross, dot, rotation_matrices
+from larp_model.physics.kinematics import Anchors, Kinematics, kinematics, turned_anchors
 from larp_model.scene import Body, Scene
 
 # States that are linearised at a time: links that touch in one of them cost time in all.
@@ -58,6 +59,20 @@ class Coordinates:
             anchors = turned_anchors(own.local_anchors, own.matrices, np.arange(1, len(body.links)), body.parents)
             changes.append(_body_change(body, state[rows], anchors, positions[of_body], rates[of_body]))
         return jnp.concatenate(changes)
+
+    def moved(self, state: Array, sizes: Array, coordinates: Array) -> Array:
+        """Return states (L, 13, B) moved by coordinates (2 V, B) that need not be small; all joints are then closed.
+
+        `difference` to the states before gives the coordinates back, to the second order.
+        """
+        scene, states = self.scene, list[Array]()
+        links = kinematics(scene, state, sizes)
+        positions, rates = (half.reshape(-1, 3, half.shape[-1]) for half in jnp.split(coordinates, 2))
+        for body in scene.bodies:
+            begin = scene.rows(body.name).start + scene.bodies.index(body)
+            of_body = slice(begin, begin + len(body.links) + 1)
+            states.append(_body_moved(body, links.of(scene, body.name), positions[of_body], rates[of_body]))
+        return jnp.concatenate(states)
 
     def of(self, state: Array, change: Array) -> Array:
         """Return the coordinates (2 V, B) of changes (L, 13, B) of states (L, 13, B), joints closed or not."""
@@ -102,6 +117,22 @@ def _body_change(body: Body, state: Array, anchors: Anchors, positions: Array, r
     w, v = state[:, 3:4], state[:, 4:7]
     quaternion = 0.5 * jnp.concatenate([-dot(turns, v), w * turns + cross(turns, v)], axis=1)
     return jnp.concatenate([position, quaternion, rate, turn_rates], axis=1)
+
+
+def _body_moved(body: Body, links: Kinematics, positions: Array, rates: Array) -> Array:
+    """Return states (n, 13, B) of a body, moved by positions and rates (n + 1, 3, B)."""
+    parents, children = body.parents, np.arange(1, len(body.links))
+    turns, turn_rates = (part[1] + combined(body.ancestors, part[2:]) for part in (positions, rates))
+    last = (jnp.moveaxis(array, 1, -1) for array in (links.orientation, turns))
+    quaternion = jnp.moveaxis(rotation.integrate(*last), -1, 1)
+    angular_velocity = links.angular_velocity + turn_rates
+    anchors = turned_anchors(links.local_anchors, rotation_matrices(quaternion), children, parents)
+    # Both points of a joint are at one place, and move together.
+    steps = anchors.parent - anchors.child
+    speeds = cross(angular_velocity[parents], anchors.parent) - cross(angular_velocity[children], anchors.child)
+    position = links.position[:1] + positions[:1] + combined(body.ancestors, steps)
+    velocity = links.velocity[:1] + rates[:1] + combined(body.ancestors, speeds)
+    return jnp.concatenate([position, quaternion, velocity, angular_velocity], axis=1)
 
 
 def linearized(scene: Scene, step: Step, state: Array, control: Array, sizes: Array) -> tuple[Array, Array]:

@@ -144,6 +144,13 @@ class Simulator:
         coordinates: Array = _difference(self.scene, *flat).reshape(*state.shape[:-2], -1)
         return coordinates
 
+    def moved(self, states: ArrayLike, coordinates: ArrayLike) -> Array:
+        """Return states (*, L, 13) moved by coordinates (*, 2 V), with all joints closed: see `linearization`."""
+        state, change = _array("states", states), _array("coordinates", coordinates)
+        flat = state.reshape(-1, *state.shape[-2:]), change.reshape(-1, change.shape[-1])
+        result: Array = _moved(self.scene, *flat, jnp.asarray(self.morphology, state.dtype)).reshape(state.shape)
+        return result
+
     def basis(self, states: ArrayLike) -> Array:
         """Return changes (*, L, 13, 2 V) of states (*, L, 13) per unit of each coordinate: see `linearization`."""
         state = _array("states", states)
@@ -230,6 +237,11 @@ def _linearized(model: Model, weights: Weights, state: Array, control: Array, si
 @partial(jax.jit, static_argnums=0, inline=True)
 def _difference(scene: Scene, state: Array, reference: Array) -> Array:
     return Coordinates(scene).difference(*(jnp.moveaxis(array, 0, -1) for array in (state, reference))).T
+
+
+@partial(jax.jit, static_argnums=0, inline=True)
+def _moved(scene: Scene, state: Array, coordinates: Array, sizes: Array) -> Array:
+    return jnp.moveaxis(Coordinates(scene).moved(jnp.moveaxis(state, 0, -1), sizes[..., None], coordinates.T), -1, 0)
 
 
 @partial(jax.jit, static_argnums=0, inline=True)

@@ -34,23 +34,28 @@ class Dynamics(Protocol):
 
 
 @runtime_checkable
-class Linearizable(Dynamics, Protocol):
-    """Dynamics whose steps have derivatives by coordinates of small changes of a state, n of them.
+class Coordinated(Dynamics, Protocol):
+    """Dynamics whose states have n coordinates of small changes: positions first, and then their rates."""
 
-    `larp_model.Simulator` is one.
-    """
+    def difference(self, states: jax.Array, references: jax.Array) -> jax.Array:
+        """Return the coordinates (H, n) of the deviations of states (H, L, 13) from references (H, L, 13)."""
+
+    def moved(self, states: jax.Array, coordinates: jax.Array) -> jax.Array:
+        """Return states (H, L, 13) moved by coordinates (H, n): the inverse of `difference`, near zero."""
+
+    def basis(self, states: jax.Array) -> jax.Array:
+        """Return derivatives (H, L, 13, n) of states (H, L, 13) by their coordinates."""
+
+
+@runtime_checkable
+class Linearizable(Coordinated, Protocol):
+    """Dynamics whose steps have derivatives by these coordinates; `larp_model.Simulator` is one."""
 
     def linearize(self, states: jax.Array, controls: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return A (H, n, n) and B (H, n, 3 J): steps from states (H, L, 13), controls (H, J, 3) [rad] add A d + B v.
 
         d (n,): small deviations of states. v (3 J,): small changes of controls [rad].
         """
-
-    def difference(self, states: jax.Array, references: jax.Array) -> jax.Array:
-        """Return the coordinates (H, n) of the deviations of states (H, L, 13) from references (H, L, 13)."""
-
-    def basis(self, states: jax.Array) -> jax.Array:
-        """Return derivatives (H, L, 13, n) of states (H, L, 13) by their coordinates."""
 
 
 def side_by_side(dynamics: Dynamics) -> int:

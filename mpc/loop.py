@@ -227,6 +227,10 @@ def predicted_state(
     return last
 
 
+Sense = Callable[[int, np.ndarray, np.ndarray | None], np.ndarray]
+"""(step, true state (L, 13), joint targets (J, 3) [rad] of the step before, if any) -> state that the planners get."""
+
+
 @dataclass
 class _Loop:
     """The state of an execution between its steps.
@@ -323,14 +327,14 @@ def execute(
     steps: int,
     key: jax.Array,
     observe: Callable[[Execution], None] = lambda execution: None,
-    sense: Callable[[np.ndarray], np.ndarray] = lambda state: state,
+    sense: Sense | None = None,
     checkpoint: Checkpoint | None = None,
     latency: Latency | None = None,
 ) -> Execution:
     """Plan, execute and replan for `steps`, from a state (L, 13) on, one phase after the other.
 
     After the last phase its plan is executed and, after the plan's end, the task's reference. observe: called after
-    every step. sense: returns the state that the planners get in a true state (L, 13); the same by default.
+    every step. sense: returns the state that the planners get; the true one by default.
     checkpoint: to continue from, without feedback until the next plan; the plans in the result are then those from
     there on. latency: of all plans but the first, for which the world waits; none by default. Raises `DivergenceError`
     as soon as the world diverges, and InputError where plans are expected to take longer than their horizon.
@@ -348,7 +352,9 @@ def execute(
     world.reset(execution.states[-1][None])
     try:
         for step in range(len(execution.controls), steps):
-            sensed = sense(execution.states[-1])
+            sensed = execution.states[-1]
+            if sense is not None:
+                sensed = sense(step, sensed, execution.controls[-1] if execution.controls else None)
             loop.enter_phase(step, sensed)
             execution.plans += loop.update(step, sensed)
             execution.controls.append(loop.target(step, sensed))

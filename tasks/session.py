@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 from larp_model.engines.mujoco import SUBSTEPS, Truth
 from mpc import Dynamics, Optimizer, Planner, Verified, Window
 from mpc.dynamics import linearizable
-from mpc.loop import Execution, Latency, Phase, World, execute
+from mpc.loop import Execution, Latency, Phase, Sense, World, execute
 from tasks.models import NO_WEIGHTS, DynamicsName, models_of
 from tasks.presets import PRESETS, Preset, PresetName, Seconds, preset_of, usable, within
 from tasks.run import AFTER_CONTACT, Run
@@ -136,7 +136,7 @@ class Session:
         state: ArrayLike | None = None,
         steps: int | None = None,
         observe: Callable[[Execution], None] = lambda execution: None,
-        sense: Callable[[np.ndarray], np.ndarray] = lambda state: state,
+        sense: Sense | None = None,
         recovers: bool = True,
         world: World | None = None,
         window: Callable[[int], Window] | None = None,
@@ -180,8 +180,8 @@ class Session:
         """Plan for a goal and execute in MuJoCo, or in a world of your own.
 
         goal: of a kick, the target (3,) [m]. preset: its name, or one of your own. seed: of the planner's random
-        numbers. state: (L, 13) to begin in; see `Task.start`. observe: called after every step. latency: of plans, while
-        the world goes on, see `mpc.realtime`; by default the world waits for them.
+        numbers. state: (L, 13) to begin in; see `Task.start`. observe: called after every step. latency: of plans,
+        while the world goes on, see `mpc.realtime`; by default the world waits for them.
         """
         goal = self.task.check(goal)
         execution = self.execute(

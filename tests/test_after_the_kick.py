@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
+from larp_model.engines.mujoco import Truth
 from larp_model.physics import kinematics
 from mpc import evaluate
 from tasks import kick, sensing
@@ -127,14 +128,51 @@ def test_a_rolling_ball_is_where_it_would_rest_when_the_reference_strikes(task: 
         assert strike_step(path[:, None], path) is None
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("sensors", ["noisy", "lab"])
+def test_the_filter_sees_the_kick_better_than_its_sensors_and_says_how_well(
+    task: kick.Kick, sensors: sensing.SensorName
+) -> None:
+    estimators = [sensing.estimator_of(task.scene, name) for name in ("none", "filter")]
+    start, truth = task.start((0.02, -0.01)), Truth(task.scene, 1, task.substeps, threads=1)
+    raw, filtered = (
+        sensing.perception(task.scene, task.start(), sensors, estimator, np.random.default_rng(1))
+        for estimator in estimators
+    )
+    assert raw is not None and filtered is not None
+    truth.reset(start[None])
+    window, state, control = task.window((4.0, 0.0, 0.5)), start, None
+    joints, ball = np.arange(6, 42), np.arange(42, 45)
+    errors = []
+    for step in range(task.reference.strike - 1):
+        deviations = [
+            np.asarray(raw.sensors.dynamics.difference(state.astype(np.float32), each(step, state, control)))
+            for each in (raw, filtered)
+        ]
+        errors.append(deviations)
+        control = np.asarray(window(step).reference)[0]
+        state = truth.step(control[None])[0]
+    late = np.sqrt(np.mean(np.square(np.array(errors)[15:]), axis=0))
+    for rows in (joints, ball):
+        of_raw, of_filter = np.sqrt(np.mean(np.square(late[:, rows]), axis=1))
+        assert of_filter < 0.7 * of_raw
+    covariances = [estimate.covariance for estimate in filtered.estimates[15:]]
+    normalised = [
+        error[rows] @ np.linalg.inv(covariance[np.ix_(rows, rows)]) @ error[rows] / len(rows)
+        for (_, error), covariance in zip(errors[15:], covariances, strict=True)
+        for rows in (joints,)
+    ]
+    assert 0.4 < np.mean(normalised) < 1.5
+
+
 def test_sensing_keeps_joints_closed_and_has_the_noise_it_says(task: kick.Kick) -> None:
-    sense = sensing.noisy(task.scene, np.random.default_rng(0))
+    sensors = sensing.SensorModel(task.scene, sensing.SENSORS["noisy"], np.random.default_rng(0))
     state = task.reference.states[25].astype(float)
-    seen = np.stack([sense(state) for _ in range(200)])
+    seen = np.stack([sensors.measure(state).state for _ in range(200)])
     shape = kinematics.morphology_of(task.scene)[None]
     apart = kinematics.displacement(task.scene, jnp.asarray(seen), shape)
     assert float(jnp.abs(apart).max()) < 1e-5
-    assert np.std(seen[:, task.ball, :3] - state[task.ball, :3]) == pytest.approx(sensing.BALL, rel=0.15)
+    assert np.std(seen[:, task.ball, :3] - state[task.ball, :3]) == pytest.approx(0.005, rel=0.15)
     np.testing.assert_allclose(seen[:, 0, :7], np.broadcast_to(state[0, :7], (200, 7)), atol=1e-6)
     child, joint, _ = task.scene.human.motors[-1]
     true, noisy = (
@@ -143,4 +181,4 @@ def test_sensing_keeps_joints_closed_and_has_the_noise_it_says(task: kick.Kick) 
         for each in (state, seen)
     )
     error = np.degrees((true.inv() * noisy).as_rotvec())
-    assert error.std() == pytest.approx(sensing.JOINTS, rel=0.15)
+    assert error.std() == pytest.approx(0.5, rel=0.15)

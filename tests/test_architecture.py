@@ -61,6 +61,7 @@ ORDER = [
     "larp_model.commands",
     "mpc.dynamics",
     "mpc.feedback",
+    "mpc.estimator",
     "mpc.spline",
     "mpc.cost",
     "mpc.search",

@@ -47,6 +47,9 @@ class Unstable:
     def basis(self, states: jax.Array) -> jax.Array:
         return jnp.broadcast_to(jnp.eye(13, 3), (*states.shape, 3))
 
+    def moved(self, states: jax.Array, coordinates: jax.Array) -> jax.Array:
+        return states.at[..., 0, :3].add(coordinates)
+
 
 @dataclass
 class Pushed:

@@ -136,7 +136,7 @@ def test_planners_see_what_is_sensed_and_the_truth_goes_on_from_the_truth() -> N
         (Phase(planner, planner, 3, _window),),
         6,
         jax.random.key(0),
-        sense=lambda state: state + shift,
+        sense=lambda step, state, control: state + shift,
     )
     for plan in execution.plans:
         np.testing.assert_allclose(plan.state, execution.states[plan.step] + shift)

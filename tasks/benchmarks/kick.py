@@ -22,7 +22,6 @@ from tasks.kick import USUAL, Kick
 from tasks.models import DynamicsName
 from tasks.presets import PresetName, preset_of
 from tasks.run import replayed, summary_of
-from tasks.sensing import noisy
 from tasks.session import Planners, Session
 from tasks.targets import random_kick, random_roll
 from tasks.task import HEIGHT
@@ -45,7 +44,6 @@ class KickSettings:
     body: Detail
     self_contact: bool
     rolling: float
-    noise: bool
     budget: float | None
     substeps: int
 
@@ -69,7 +67,6 @@ class KickSettings:
             "body": self.body if self.body != "lean" else "",
             "self_contact": "on" if self.self_contact else "",
             "rolling": f"{self.rolling:g}" if self.rolling else "",
-            "noise": "on" if self.noise else "",
             "budget": f"{self.budget:g}" if self.budget is not None else "",
             "substeps": f"{self.substeps}" if self.substeps != FINE_SUBSTEPS else "",
         }
@@ -93,7 +90,6 @@ class KickSettings:
         flags = {
             "reference": f"--reference {self.reference.name if self.reference else ''}",
             "self_contact": "--self-contact",
-            "noise": "--noise",
         }
         variant = (flags.get(option, f"--{option} {value}") for option, value in self.variant.items())
         planned = f"--targets {self.targets} --seed {self.seed} --preset {self.preset} --dynamics {self.dynamics}"
@@ -173,7 +169,6 @@ def main(
     body: Detail = "lean",
     self_contact: bool = False,
     rolling: float = 0.0,
-    noise: bool = False,
     budget: float | None = None,
     substeps: int = FINE_SUBSTEPS,
     publish: bool = False,
@@ -193,13 +188,12 @@ def main(
         body: lean: 13 links; full: 26, with a spine, hands and toes.
         self_contact: let one leg touch the other.
         rolling: greatest speed [m/s] of a ball that comes from ahead or from the kicking side; 0: it rests.
-        noise: show the planner the state with sensing noise.
         budget: seconds for the first plan, and a fifth of them for each replan; the preset is scaled to fit.
         substeps: engine steps of the ground truth in a step of 10 ms, where plans are validated and executed.
         publish: put the table into RESULTS.md.
     """
     settings = KickSettings(
-        targets, seed, preset, dynamics, weights, reference, height, bodies, body, self_contact, rolling, noise, budget,
+        targets, seed, preset, dynamics, weights, reference, height, bodies, body, self_contact, rolling, budget,
         substeps,
     )  # fmt: skip
     settings.check()
@@ -261,8 +255,7 @@ def kick_row(
     target: (3,) [m]. shift: of the ball (2,) [m]. roll: its velocity (2,) [m/s].
     """
     session, kick, seed = planned.session, planned.session.task, settings.seed + index
-    sense = noisy(kick.scene, np.random.default_rng((settings.seed, index))) if settings.noise else lambda state: state
-    execution = session.execute(planned.planners, target, seed, kick.start(shift, roll), sense=sense)
+    execution = session.execute(planned.planners, target, seed, kick.start(shift, roll))
     return summary_of(kick, execution, target) | {
         "halved_error_m": replayed(kick, execution, target, 2 * settings.substeps),
         "preset": settings.preset,

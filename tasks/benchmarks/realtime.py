@@ -15,6 +15,7 @@ from rich.table import Table
 
 from larp_model.engines.mujoco import SUBSTEPS, Truth
 from larp_model.errors import InputError
+from mpc.estimator import Estimator
 from mpc.loop import Execution, Latency, World
 from mpc.realtime import PacedWorld, PlanningThread, SimulatedLatency
 from tasks.benchmarks import report
@@ -24,7 +25,7 @@ from tasks.kick import USUAL, Kick
 from tasks.models import DynamicsName
 from tasks.presets import PresetName, preset_of
 from tasks.run import plans_of, summary_of
-from tasks.sensing import noisy
+from tasks.sensing import EstimatorName, SensorName, estimator_of, perception
 from tasks.session import Planners, Session
 from tasks.targets import random_kick, random_roll
 
@@ -43,8 +44,9 @@ class RealtimeSettings:
     dynamics: tuple[DynamicsName, ...]
     interval: tuple[int, ...]
     substeps: int
+    sensors: tuple[SensorName, ...]
+    estimator: tuple[EstimatorName, ...]
     rolling: float
-    noise: bool
 
     def check(self) -> None:
         """Raise InputError if a setting is invalid."""
@@ -70,19 +72,20 @@ class RealtimeSettings:
             parts.append(f"--interval {' '.join(map(str, self.interval))}")
         if self.substeps != SUBSTEPS:
             parts.append(f"--substeps {self.substeps}")
+        parts.append(f"--sensors {' '.join(self.sensors)} --estimator {' '.join(self.estimator)}")
         if self.rolling:
             parts.append(f"--rolling {self.rolling:g}")
-        if self.noise:
-            parts.append("--noise")
         return " ".join(parts)
 
     def points(self) -> list[Point]:
         """Return the points to measure, each once."""
         return [
-            Point(preset, dynamics, interval, delay)
+            Point(preset, dynamics, interval, sensors, estimator, delay)
             for dynamics in self.dynamics
             for preset in self.preset
             for interval in self.interval or (preset_of(preset).interval,)
+            for sensors in self.sensors
+            for estimator in (self.estimator if sensors != "perfect" else self.estimator[:1])
             for delay in self.delay
         ]
 
@@ -97,17 +100,20 @@ def _milliseconds(delay: str) -> float:
 
 
 class Point(NamedTuple):
-    """A planner's preset and model, steps between its replans, and the delay of its plans."""
+    """A preset, its model and interval, what it sees of the state, and the delay of its plans."""
 
     preset: PresetName
     dynamics: DynamicsName
     interval: int
+    sensors: SensorName
+    estimator: EstimatorName
     delay: str
 
     @property
     def planner(self) -> str:
-        """Return the planner as text."""
-        return f"{self.dynamics}, {self.preset}, every {self.interval}"
+        """Return the planner, and what it sees, as text."""
+        seen = "perfect" if self.sensors == "perfect" else f"{self.sensors}, estimator {self.estimator}"
+        return f"{self.dynamics}, {self.preset}, every {self.interval}; {seen}"
 
     @property
     def name(self) -> str:
@@ -128,6 +134,7 @@ class Sessions:
         self.settings, self.kick = settings, Kick.standard()
         self._sessions: dict[str, Session] = {}
         self._seconds: dict[tuple[str, str, int], list[float]] = {}
+        self._estimators: dict[str, Estimator] = {}
 
     def session(self, dynamics: DynamicsName) -> Session:
         """Return the session of a model."""
@@ -139,6 +146,12 @@ class Sessions:
         """Return the planners of a point."""
         preset = replace(preset_of(point.preset), interval=point.interval)
         return self.session(point.dynamics).planners(preset)
+
+    def estimator(self, name: EstimatorName) -> Estimator:
+        """Return an estimator of the kick's states."""
+        if name not in self._estimators:
+            self._estimators[name] = estimator_of(self.kick.scene, name)
+        return self._estimators[name]
 
     def seconds(self, point: Point) -> list[float]:
         """Return the times [s] that the plans of a kick took, after another kick that compiled all programs."""
@@ -153,10 +166,9 @@ class Sessions:
     def timing(self, point: Point, seed: int) -> tuple[Latency, World]:
         """Return the latency of a point's plans, and the world for it."""
         dt, world = self.kick.scene.dt, Truth(self.kick.scene, 1, self.kick.substeps, threads=1)
-        seconds = self.seconds(point)
         if point.delay == CLOCK:
-            return PlanningThread(dt, max(seconds)), PacedWorld(world, dt)
-        delays = seconds if point.delay == MEASURED else 1e-3 * float(point.delay)
+            return PlanningThread(dt, max(self.seconds(point))), PacedWorld(world, dt)
+        delays = self.seconds(point) if point.delay == MEASURED else 1e-3 * float(point.delay)
         return SimulatedLatency(dt, delays, seed), world
 
 
@@ -165,7 +177,8 @@ def kick_row(
 ) -> report.Row:
     """Return the row of a kick: its summary, and what plans made of the time. See `kick.kick_row` for arguments."""
     settings, kick, seed = sessions.settings, sessions.kick, sessions.settings.seed + index
-    sense = noisy(kick.scene, np.random.default_rng((settings.seed, index))) if settings.noise else lambda state: state
+    random = np.random.default_rng((settings.seed, index))
+    sense = perception(kick.scene, kick.start(), point.sensors, sessions.estimator(point.estimator), random)
     latency, world = sessions.timing(point, seed)
     execution = sessions.session(point.dynamics).execute(
         sessions.planners(point), target, seed, kick.start(shift, roll), sense=sense, world=world, latency=latency
@@ -269,8 +282,9 @@ def main(
     dynamics: tuple[DynamicsName, ...] = ("larp",),
     interval: tuple[int, ...] = (),
     substeps: int = SUBSTEPS,
+    sensors: tuple[SensorName, ...] = ("perfect",),
+    estimator: tuple[EstimatorName, ...] = ("filter",),
     rolling: float = 0.0,
-    noise: bool = False,
     json: Path = Path("runs/benchmarks/realtime.json"),
     publish: bool = False,
 ) -> None:
@@ -285,12 +299,13 @@ def main(
         dynamics: the planner's model: larp or mujoco.
         interval: steps between replans at least; those of the preset by default.
         substeps: engine steps in a step of MuJoCo as the model.
+        sensors: perfect; noisy: joint angles, velocities and the ball's place are; lab: motion capture.
+        estimator: of the state: none, which takes the last measurement, or filter.
         rolling: greatest speed [m/s] of a ball that comes from ahead or from the kicking side; 0: it rests.
-        noise: show the planner the state with sensing noise.
         json: where the figures go; the picture goes beside them.
         publish: put the table into RESULTS.md.
     """
-    settings = RealtimeSettings(targets, seed, delay, preset, dynamics, interval, substeps, rolling, noise)
+    settings = RealtimeSettings(targets, seed, delay, preset, dynamics, interval, substeps, sensors, estimator, rolling)
     settings.check()
     report.ready(json, publish)
     prepare_jax()
