@@ -112,8 +112,12 @@ class Point(NamedTuple):
     @property
     def planner(self) -> str:
         """Return the planner, and what it sees, as text."""
-        seen = "perfect" if self.sensors == "perfect" else f"{self.sensors}, estimator {self.estimator}"
-        return f"{self.dynamics}, {self.preset}, every {self.interval}; {seen}"
+        return f"{self.dynamics}, {self.preset}, every {self.interval}; {self.sees}"
+
+    @property
+    def sees(self) -> str:
+        """Return the sensors and the estimator as text."""
+        return "the state" if self.sensors == "perfect" else f"{self.sensors}, {self.estimator}"
 
     @property
     def name(self) -> str:
@@ -225,7 +229,11 @@ def point_figures(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def table_of(figures: dict[Point, dict[str, Any]], settings: RealtimeSettings) -> Table:
-    """Return a table with one line a point."""
+    """Return a table with one line a point.
+
+    missed: replans that missed their deadline. off by: the state predicted for the beginning of a plan. The others are
+    misses of the target in the ground truth, and falls.
+    """
     columns = (
         "planner",
         "delay",
@@ -239,7 +247,8 @@ def table_of(figures: dict[Point, dict[str, Any]], settings: RealtimeSettings) -
     table = Table(*columns, "fell", title=f"Real time, {settings.targets} targets")
     for point, values in figures.items():
         table.add_row(
-            point.planner,
+            f"{point.dynamics}, {point.preset}, every {point.interval}",
+            point.sees,
             delay_text(point.delay),
             f"{values['replans_per_second']:.1f}",
             f"{values['deadlines_missed']} of {values['replans']}",
@@ -285,7 +294,7 @@ def main(
     sensors: tuple[SensorName, ...] = ("perfect",),
     estimator: tuple[EstimatorName, ...] = ("filter",),
     rolling: float = 0.0,
-    json: Path = Path("runs/benchmarks/realtime.json"),
+    json: Path | None = None,
     publish: bool = False,
 ) -> None:
     """Plan and execute kicks to random targets in a world that does not wait for plans.
@@ -307,6 +316,7 @@ def main(
     """
     settings = RealtimeSettings(targets, seed, delay, preset, dynamics, interval, substeps, sensors, estimator, rolling)
     settings.check()
+    json = json or Path(f"runs/benchmarks/realtime_{'_'.join(sensors)}.json")
     report.ready(json, publish)
     prepare_jax()
     points = settings.points()
@@ -323,7 +333,7 @@ def main(
     table = table_of(figures, settings)
     report.show(table)
     if publish:
-        report.publish("realtime", f"Real time, {targets} targets", settings.command, table)
+        report.publish(f"realtime_{'_'.join(sensors)}", f"Real time, {targets} targets", settings.command, table)
 
 
 def jobs_of(settings: RealtimeSettings, points: list[Point]) -> dict[str, Callable[[], report.Row]]:
