@@ -175,17 +175,20 @@ class Session:
         state: ArrayLike | None = None,
         observe: Callable[[Execution], None] = lambda execution: None,
         world: World | None = None,
+        sense: Sense | None = None,
         latency: Latency | None = None,
     ) -> Run:
         """Plan for a goal and execute in MuJoCo, or in a world of your own.
 
         goal: of a kick, the target (3,) [m]. preset: its name, or one of your own. seed: of the planner's random
-        numbers. state: (L, 13) to begin in; see `Task.start`. observe: called after every step. latency: of plans,
-        while the world goes on, see `mpc.realtime`; by default the world waits for them.
+        numbers. state: (L, 13) to begin in; see `Task.start`. observe: called after every step. sense: what the
+        planner gets to see, see `tasks.sensing`; the state by default. latency: of plans, while the world goes on, see
+        `mpc.realtime`; by default the world waits for them.
         """
         goal = self.task.check(goal)
+        planners = self.planners(preset)
         execution = self.execute(
-            self.planners(preset), goal, seed, state, observe=observe, world=world, latency=latency
+            planners, goal, seed, state, observe=observe, sense=sense, world=world, latency=latency
         )
         name = preset if isinstance(preset, str) else type(preset).__name__
         weights = self.models.weights

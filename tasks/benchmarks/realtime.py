@@ -234,17 +234,8 @@ def table_of(figures: dict[Point, dict[str, Any]], settings: RealtimeSettings) -
     missed: replans that missed their deadline. off by: the state predicted for the beginning of a plan. The others are
     misses of the target in the ground truth, and falls.
     """
-    columns = (
-        "planner",
-        "delay",
-        "replans a second",
-        "deadlines missed",
-        "prediction off by",
-        "mean",
-        "median",
-        "95 %",
-    )
-    table = Table(*columns, "fell", title=f"Real time, {settings.targets} targets")
+    columns = ("planner", "sees", "delay", "replans/s", "missed", "off by", "mean", "median", "95 %", "fell")
+    table = Table(*columns, title=f"Real time, {settings.targets} targets")
     for point, values in figures.items():
         table.add_row(
             f"{point.dynamics}, {point.preset}, every {point.interval}",
@@ -263,23 +254,27 @@ def picture(figures: dict[Point, dict[str, Any]]) -> Figure:
     """Plot misses over delay and over the rate of replans, a line for each planner."""
     figure = Figure(figsize=(11, 4.5), layout="constrained")
     over_delay, over_rate = figure.subplots(1, 2)
-    for planner in dict.fromkeys(point.planner for point in figures):
+    highest = 100.0 * max(value["mean_truth_error_m"] for value in figures.values())
+    for number, planner in enumerate(dict.fromkeys(point.planner for point in figures)):
         own = {point: value for point, value in figures.items() if point.planner == planner}
-        places = [
-            value["lead_ms"] if point.delay in (MEASURED, CLOCK) else float(point.delay) for point, value in own.items()
-        ]
-        order = np.argsort(places)
-        misses = np.array([100.0 * value["mean_truth_error_m"] for value in own.values()])
-        over_delay.plot(np.array(places)[order], misses[order], marker="o", label=planner)
-        for place, miss, point in zip(places, misses, own, strict=True):
-            if point.delay in (MEASURED, CLOCK):
-                over_delay.annotate(point.delay, (place, miss), (4, 4), textcoords="offset points", fontsize=8)
+        misses = {point: 100.0 * value["mean_truth_error_m"] for point, value in own.items()}
+        by_clock = [point for point in own if point.delay in (MEASURED, CLOCK)]
+        fixed = sorted(own.keys() - set(by_clock), key=lambda point: float(point.delay))
+        colour = f"C{number}"
+        over_delay.plot(
+            [float(point.delay) for point in fixed], [misses[point] for point in fixed], "o-", c=colour, label=planner
+        )
+        for point in by_clock:
+            place = own[point]["lead_ms"], misses[point]
+            over_delay.plot(*place, "D", c=colour, label=None if fixed or point is not by_clock[0] else planner)
+            over_delay.annotate(point.delay, place, (6, 4), textcoords="offset points", fontsize=8)
         rates = [value["replans_per_second"] for value in own.values()]
-        over_rate.scatter(rates, misses)
+        over_rate.scatter(rates, misses.values(), color=colour)
     for axes, label in ((over_delay, "delay [ms]"), (over_rate, "replans a second")):
-        axes.set(xlabel=label, ylabel="mean miss in MuJoCo [cm]", ylim=(0.0, None))
+        axes.set(xlabel=label, ylabel="mean miss in MuJoCo [cm]", ylim=(0.0, 1.25 * highest))
         axes.grid(color="0.92")
-    over_delay.legend(frameon=False, fontsize=8)
+        axes.set_axisbelow(True)
+    over_delay.legend(frameon=False, fontsize=8, loc="upper left")
     return figure
 
 
