@@ -17,7 +17,7 @@ import numpy as np
 
 from larp_model import state as packed
 from larp_model.errors import InputError
-from mpc.feedback import Feedback, FeedbackInfo
+from mpc.feedback import Feedback, FeedbackInfo, finite_part
 from mpc.planner import Plan, PlanInfo, Planner, Window
 
 
@@ -206,7 +206,8 @@ def predicted_state(
 ) -> np.ndarray:
     """Return the state (L, 13) that a planner of a phase predicts `lead` steps on, under the targets sent until then.
 
-    Targets that answer deviations are those along a first prediction, without feedback.
+    Targets that answer deviations are those along a first prediction, without feedback. Where the model diverges, its
+    last finite state is returned.
     """
     if not lead:
         return state
@@ -221,9 +222,9 @@ def predicted_state(
 
     without_feedback = None if active is None else replace(active, feedback=None)
     states = rolled_out(targets(np.repeat(state[None], lead, axis=0), without_feedback))
-    if active is not None and active.feedback is not None:
+    if active is not None and active.feedback is not None and np.isfinite(states).all():
         states = rolled_out(targets(states[:-1], replace(active)))
-    last: np.ndarray = states[-1]
+    last: np.ndarray = finite_part(states)[-1]
     return last
 
 

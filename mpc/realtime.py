@@ -13,8 +13,10 @@ import numpy as np
 from larp_model.errors import InputError
 from mpc.loop import PlanResult, World
 
-# The next plan is expected to take as long as the longest of so many before it.
+# The next plan is expected to take as long as the longest of so many before it,
 RECENT = 20
+# and by the clock so many steps longer: one in 20 takes longer than the 20 before it.
+MARGIN = 2
 
 
 class Leads:
@@ -109,7 +111,7 @@ class PlanningThread:
     @property
     def lead(self) -> int:
         """See `loop.Latency`."""
-        return self._leads.expected
+        return self._leads.expected + MARGIN
 
     def submit(self, step: int, job: Callable[[], PlanResult]) -> None:
         """See `loop.Latency`."""

@@ -12,7 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from larp_model.engines.mujoco import SUBSTEPS, Truth
-from mpc import Dynamics, Optimizer, Planner, Verified, Window
+from mpc import Dynamics, Optimizer, Plan, PlanInfo, Planner, Verified, Window
 from mpc.dynamics import linearizable
 from mpc.loop import Execution, Latency, Phase, Sense, World, execute
 from tasks.models import NO_WEIGHTS, DynamicsName, models_of
@@ -113,19 +113,19 @@ class Session:
     def seconds(self, goal: Any, preset: Preset) -> Seconds:
         """Return the times that the preset's plans take for a goal, with full horizons."""
         planners, window = self.planners(preset), self.task.window(goal)(0)
-        seconds = []
+        start, results = self.task.start(), list[tuple[Plan, PlanInfo]]()
         for planner, ahead, links in (
             (planners.first, window, slice(None)),
             (planners.replan, window, slice(None)),
             (planners.recovery, self._standing.window(0), self.task.human),
         ):
-            plan, state = planner.init(jax.random.key(0)), self.task.start()[links]
-            seconds.append(min(planner.step(plan, state, ahead)[1].seconds for _ in range(2)))
-        times = Seconds(*seconds)
+            plans = [planner.step(planner.init(jax.random.key(0)), start[links], ahead) for _ in range(2)]
+            results.append(min(plans, key=lambda result: result[1].seconds))
+        times = Seconds(*(info.seconds for _, info in results))
         if not planners.feedback:
             return times
-        plan, info = planners.first.step(planners.first.init(jax.random.key(0)), self.task.start(), window)
-        timed = (planners.first.feedback(plan, info, self.task.start(), window)[1].seconds for _ in range(2))
+        plan, info = results[0]
+        timed = (planners.first.feedback(plan, info, start, window)[1].seconds for _ in range(2))
         return times._replace(feedback=min(timed))
 
     def execute(

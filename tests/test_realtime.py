@@ -98,6 +98,22 @@ def test_a_plan_starts_from_the_state_that_the_model_predicts_for_its_beginning(
         assert plan.error == pytest.approx(0.2 * np.linalg.norm(moved[0, :3]), rel=1e-4)
 
 
+def test_where_the_model_diverges_a_plan_starts_from_its_last_finite_state() -> None:
+    @dataclass(frozen=True)
+    class Fragile(Slider):
+        """Lost from its second step on."""
+
+        def rollout(self, state: jax.Array, controls: jax.Array, steps: jax.Array | None = None) -> jax.Array:
+            states = super().rollout(state, controls, steps)
+            return states.at[:, 1:].set(jnp.nan)
+
+    terms = (CostTerm("miss", lambda states, controls, target: states[-1, 0, :3] - target),)
+    planner = Planner(Fragile(), terms, HORIZON, 3, DT, np.full((1, 3), 0.1), GaussNewton(2, 9))
+    execution = executed(SimulatedLatency(DT, 0.03), planner=planner)
+    assert begins(execution)[:2] == [(0, 0, 0), (1, 4, 4)]
+    assert all(np.isfinite(plan.state).all() for plan in execution.plans)
+
+
 def test_a_late_plan_is_joined_where_it_would_be_by_then_and_the_next_is_expected_later() -> None:
     planner = planner_of()
     latency = SimulatedLatency(DT, [0.01, 0.04])
