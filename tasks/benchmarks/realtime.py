@@ -171,7 +171,7 @@ class Sessions:
         """Return the latency of a point's plans, and the world for it."""
         dt, world = self.kick.scene.dt, Truth(self.kick.scene, 1, self.kick.substeps, threads=1)
         if point.delay == CLOCK:
-            return PlanningThread(dt, max(self.seconds(point))), PacedWorld(world, dt)
+            return PlanningThread(dt, float(np.median(self.seconds(point)))), PacedWorld(world, dt)
         delays = self.seconds(point) if point.delay == MEASURED else 1e-3 * float(point.delay)
         return SimulatedLatency(dt, delays, seed), world
 
