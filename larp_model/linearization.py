@@ -13,7 +13,7 @@ Arrays of `Coordinates` have the batch last, as in `linalg`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import jax
@@ -47,17 +47,10 @@ class Coordinates:
 
     def change(self, state: Array, sizes: Array, coordinates: Array) -> Array:
         """Return the change (L, 13, B) of states (L, 13, B) of links of sizes (L, 3, B), by coordinates (2 V, B)."""
-        scene = self.scene
-        links = kinematics(scene, state, sizes)
-        positions, rates = (half.reshape(-1, 3, half.shape[-1]) for half in jnp.split(coordinates, 2))
         changes = []
-        for body in scene.bodies:
-            rows = scene.rows(body.name)
-            begin = rows.start + scene.bodies.index(body)
-            of_body = slice(begin, begin + len(body.links) + 1)
-            own = links.of(scene, body.name)
-            anchors = turned_anchors(own.local_anchors, own.matrices, np.arange(1, len(body.links)), body.parents)
-            changes.append(_body_change(body, state[rows], anchors, positions[of_body], rates[of_body]))
+        for body, links, positions, rates in self._by_body(state, sizes, coordinates):
+            anchors = turned_anchors(links.local_anchors, links.matrices, np.arange(1, len(body.links)), body.parents)
+            changes.append(_body_change(body, links.state, anchors, positions, rates))
         return jnp.concatenate(changes)
 
     def moved(self, state: Array, sizes: Array, coordinates: Array) -> Array:
@@ -65,14 +58,19 @@ class Coordinates:
 
         `difference` to the states before gives the coordinates back, to the second order.
         """
-        scene, states = self.scene, list[Array]()
-        links = kinematics(scene, state, sizes)
+        return jnp.concatenate([_body_moved(*parts) for parts in self._by_body(state, sizes, coordinates)])
+
+    def _by_body(
+        self, state: Array, sizes: Array, coordinates: Array
+    ) -> Iterator[tuple[Body, Kinematics, Array, Array]]:
+        """Yield each body with its links, positions and rates (n + 1, 3, B)."""
+        links = kinematics(self.scene, state, sizes)
         positions, rates = (half.reshape(-1, 3, half.shape[-1]) for half in jnp.split(coordinates, 2))
-        for body in scene.bodies:
-            begin = scene.rows(body.name).start + scene.bodies.index(body)
+        begin = 0
+        for body in self.scene.bodies:
             of_body = slice(begin, begin + len(body.links) + 1)
-            states.append(_body_moved(body, links.of(scene, body.name), positions[of_body], rates[of_body]))
-        return jnp.concatenate(states)
+            yield body, links.of(self.scene, body.name), positions[of_body], rates[of_body]
+            begin = of_body.stop
 
     def of(self, state: Array, change: Array) -> Array:
         """Return the coordinates (2 V, B) of changes (L, 13, B) of states (L, 13, B), joints closed or not."""

@@ -112,7 +112,7 @@ class SensorModel:
 
 @dataclass
 class Perception:
-    """What the planner sees of true states, step by step: estimates from measurements. See `mpc.loop.execute`, `sense`.
+    """Estimates of true states from measurements of them, step by step, for the planner: see `mpc.loop.Sense`.
 
     estimates: of all steps so far.
     """

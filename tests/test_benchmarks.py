@@ -142,7 +142,10 @@ def test_the_benchmark_of_real_time_delays_the_same_kicks_and_counts_missed_dead
     one, other = content["rows"]
     assert one["target"] == other["target"] and one["truth_error_m"] != other["truth_error_m"]
     assert Path("runs/benchmarks/realtime_perfect.png").is_file()
-    points = {realtime.Point(*(point[name] for name in realtime.Point._fields)): point for point in content["points"]}
+    points = {
+        realtime.RealtimePoint(*(point[name] for name in realtime.RealtimePoint._fields)): point
+        for point in content["points"]
+    }
     settings = realtime.RealtimeSettings(1, 0, ("0",), ("fast",), ("mujoco",), (), 4, ("perfect",), ("none",), 0.0)
     columns = realtime.table_of(points, settings).columns
     assert all(column.header for column in columns) and [*columns[2].cells] == ["0 ms", "40 ms"]

@@ -19,7 +19,6 @@ from mpc.estimator import Estimator
 from mpc.loop import Execution, Latency, World
 from mpc.realtime import PacedWorld, PlanningThread, SimulatedLatency
 from tasks.benchmarks import report
-from tasks.benchmarks.kick import figures_of
 from tasks.command import prepare_jax, run
 from tasks.kick import USUAL, Kick
 from tasks.models import DynamicsName
@@ -77,10 +76,10 @@ class RealtimeSettings:
             parts.append(f"--rolling {self.rolling:g}")
         return " ".join(parts)
 
-    def points(self) -> list[Point]:
+    def points(self) -> list[RealtimePoint]:
         """Return the points to measure, each once."""
         return [
-            Point(preset, dynamics, interval, sensors, estimator, delay)
+            RealtimePoint(preset, dynamics, interval, sensors, estimator, delay)
             for dynamics in self.dynamics
             for preset in self.preset
             for interval in self.interval or (preset_of(preset).interval,)
@@ -99,7 +98,7 @@ def _milliseconds(delay: str) -> float:
     return value if math.isfinite(value) else math.nan
 
 
-class Point(NamedTuple):
+class RealtimePoint(NamedTuple):
     """A preset, its model and interval, what it sees of the state, and the delay of its plans."""
 
     preset: PresetName
@@ -146,7 +145,7 @@ class Sessions:
             self._sessions[dynamics] = Session(self.kick, dynamics, substeps=self.settings.substeps)
         return self._sessions[dynamics]
 
-    def planners(self, point: Point) -> Planners:
+    def planners(self, point: RealtimePoint) -> Planners:
         """Return the planners of a point."""
         preset = replace(preset_of(point.preset), interval=point.interval)
         return self.session(point.dynamics).planners(preset)
@@ -157,7 +156,7 @@ class Sessions:
             self._estimators[name] = estimator_of(self.kick.scene, name)
         return self._estimators[name]
 
-    def seconds(self, point: Point) -> list[float]:
+    def seconds(self, point: RealtimePoint) -> list[float]:
         """Return the times [s] that the plans of a kick took, after another kick that compiled all programs."""
         key = point.dynamics, point.preset, point.interval
         if key not in self._seconds:
@@ -167,7 +166,7 @@ class Sessions:
             self._seconds[key] = latency.seconds
         return self._seconds[key]
 
-    def timing(self, point: Point, seed: int) -> tuple[Latency, World]:
+    def timing(self, point: RealtimePoint, seed: int) -> tuple[Latency, World]:
         """Return the latency of a point's plans, and the world for it."""
         dt, world = self.kick.scene.dt, Truth(self.kick.scene, 1, self.kick.substeps, threads=1)
         if point.delay == CLOCK:
@@ -177,7 +176,7 @@ class Sessions:
 
 
 def kick_row(
-    sessions: Sessions, point: Point, index: int, target: np.ndarray, shift: np.ndarray, roll: np.ndarray
+    sessions: Sessions, point: RealtimePoint, index: int, target: np.ndarray, shift: np.ndarray, roll: np.ndarray
 ) -> report.Row:
     """Return the row of a kick: its summary, and what plans made of the time. See `kick.kick_row` for arguments."""
     settings, kick, seed = sessions.settings, sessions.kick, sessions.settings.seed + index
@@ -187,13 +186,16 @@ def kick_row(
     execution = sessions.session(point.dynamics).execute(
         sessions.planners(point), target, seed, kick.start(shift, roll), sense=sense, world=world, latency=latency
     )
-    row = summary_of(kick, execution, target) | timing_figures(execution, kick.scene.dt)
-    return row | {
-        "point": point.name,
-        "overruns": world.overruns if isinstance(world, PacedWorld) else 0,
-        "seed": seed,
-        "halved_error_m": row["truth_error_m"],
-    }
+    timing_of_plans = timing_figures(execution, kick.scene.dt)
+    return (
+        summary_of(kick, execution, target)
+        | timing_of_plans
+        | {
+            "point": point.name,
+            "overruns": world.overruns if isinstance(world, PacedWorld) else 0,
+            "seed": seed,
+        }
+    )
 
 
 def timing_figures(execution: Execution, dt: float) -> dict[str, Any]:
@@ -215,20 +217,26 @@ def timing_figures(execution: Execution, dt: float) -> dict[str, Any]:
 
 def point_figures(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the figures of all kicks of a point."""
-    replans = sum(row["replans"] for row in rows)
-    return figures_of(rows) | {
-        "deadlines_missed": sum(row["deadlines_missed"] for row in rows),
-        "replans": replans,
-        "missed_share": sum(row["deadlines_missed"] for row in rows) / max(replans, 1),
-        "replans_per_second": float(np.mean([row["replans_per_second"] for row in rows])),
-        "prediction_error_m": float(np.nanmean([row["prediction_error_m"] for row in rows])),
-        "lead_ms": float(np.mean([row["lead_ms"] for row in rows])),
-        "p95_truth_error_m": float(np.quantile([row["truth_error_m"] for row in rows], 0.95)),
-        "overruns": sum(row["overruns"] for row in rows),
+    truth = np.array([row["truth_error_m"] for row in rows])
+
+    def total(name: str) -> int:
+        return int(sum(row[name] for row in rows))
+
+    def mean(name: str) -> float:
+        return float(np.nanmean([row[name] for row in rows]))
+
+    return {
+        "mean_truth_error_m": float(truth.mean()),
+        "median_truth_error_m": float(np.median(truth)),
+        "p95_truth_error_m": float(np.quantile(truth, 0.95)),
+        "mean_model_error_m": mean("model_error_m"),
+        "falls": total("fell"),
+        **{name: total(name) for name in ("replans", "deadlines_missed", "overruns")},
+        **{name: mean(name) for name in ("replans_per_second", "prediction_error_m", "lead_ms")},
     }
 
 
-def table_of(figures: dict[Point, dict[str, Any]], settings: RealtimeSettings) -> Table:
+def table_of(figures: dict[RealtimePoint, dict[str, Any]], settings: RealtimeSettings) -> Table:
     """Return a table with one line a point.
 
     missed: replans that missed their deadline. off by: the state predicted for the beginning of a plan. The others are
@@ -250,7 +258,7 @@ def table_of(figures: dict[Point, dict[str, Any]], settings: RealtimeSettings) -
     return table
 
 
-def picture(figures: dict[Point, dict[str, Any]]) -> Figure:
+def picture(figures: dict[RealtimePoint, dict[str, Any]]) -> Figure:
     """Plot misses over delay and over the rate of replans, a line for each planner."""
     figure = Figure(figsize=(11, 4.5), layout="constrained")
     over_delay, over_rate = figure.subplots(1, 2)
@@ -331,7 +339,7 @@ def main(
         report.publish(f"realtime_{'_'.join(sensors)}", f"Real time, {targets} targets", settings.command, table)
 
 
-def jobs_of(settings: RealtimeSettings, points: list[Point]) -> dict[str, Callable[[], report.Row]]:
+def jobs_of(settings: RealtimeSettings, points: list[RealtimePoint]) -> dict[str, Callable[[], report.Row]]:
     """Return the jobs that execute one kick each, by name: the same kicks at every point."""
     sessions, random = Sessions(settings), np.random.default_rng(settings.seed)
     kicks = []
