@@ -341,3 +341,23 @@ def test_executing_loads_are_found(source: str) -> None:
 
 def test_writing_a_pickle_is_no_executing_load() -> None:
     assert not list(executing_loads(ast.parse("from pickle import dumps")))
+
+
+def documented() -> Iterator[ast.ClassDef | ast.FunctionDef]:
+    """Classes and functions of the packages."""
+    for room in ("larp_model", "mpc", "viewer", "tasks"):
+        for file in (ROOT / room).rglob("*.py"):
+            for node in ast.walk(ast.parse(file.read_text())):
+                if isinstance(node, ast.ClassDef | ast.FunctionDef):
+                    yield node
+
+
+def test_no_class_name_is_used_twice() -> None:
+    names = [node.name for node in documented() if isinstance(node, ast.ClassDef)]
+    assert sorted(set(names)) == sorted(names)
+
+
+def test_no_docstring_begins_with_a_question_word() -> None:
+    words = ("What", "How", "Whether", "Which", "Where", "When", "Why", "Who", "Of")
+    first = [(node.name, (ast.get_docstring(node) or "-").split()[0]) for node in documented()]
+    assert not [name for name, word in first if word in words]
