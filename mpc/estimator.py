@@ -4,18 +4,20 @@ The filter is a Kalman filter of the error of the state, in the n coordinates of
 (`dynamics.Coordinated`): joints stay closed, and the planner's model predicts,
 
     x' = f(x, u),    P' = A P A^T + Q            A = [1, dt; 0, 1]: errors of rates become errors of positions
-    z = y - x,       K = P H^T (H P H^T + R)^-1  y: measured; H, R: its coordinates, and the variance of their errors
+    z = y - x - b,   K = P H^T (H P H^T + R)^-1  y: measured; H, R: its coordinates, and the variance of their errors
     x <- x + K z,    P <- (1 - K H) P (1 - K H)^T + K R K^T
 
 (R. Kalman, "A new approach to linear filtering and prediction problems", 1960; the last line is P. Joseph's form, which
 stays symmetric and positive.) A is not the derivative of f: contacts with the ground are so stiff that this holds for
 errors of a tenth of a millimetre, and a filter that believes it for larger ones is sure of what is false. What A lacks
-is part of Q.
+is part of Q, which grows with the changes of rates in a step: what changes much, by contacts, is predicted less well.
+The biases b of sensors, constant and unknown, are estimated as further coordinates.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
@@ -23,6 +25,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
 from larp_model.errors import InputError
@@ -36,31 +39,40 @@ LEAST_VARIANCE = 1e-10
 class Observation(NamedTuple):
     """Measurement of a state.
 
-    state (L, 13): as measured. variance (n,): of the errors of its coordinates, inf where nothing was measured. age
-    (n,) [s]: time since each was measured; only positions may be old. places (L, 3) [m]: of links' centres where they
-    are measured apart, as by motion capture. place_variance (L,) [m^2]: of each of their components, inf where not.
+    state (L, 13): as measured. variance (n,): of the errors of its coordinates, inf where nothing was measured. places
+    (L, 3) [m]: of links' centres where they are measured apart, as by motion capture. place_variance (L,) [m^2]: of
+    each of their components, inf where not. origin: the link from whose centre, and in whose axes, these places are
+    measured, as by a camera; None: they are in the world's. ground_arms (L, 3) [m]: from links' centres to the points
+    with which they rest or roll on the ground; ground_variance (L, 2): of the heights of these points [m^2] and of each
+    component of their velocities [m^2/s^2], both of which are 0; inf where links do not touch the ground.
     """
 
     state: np.ndarray
     variance: np.ndarray
-    age: np.ndarray | float = 0.0
     places: np.ndarray = np.zeros((0, 3))
     place_variance: np.ndarray = np.zeros(0)
+    origin: int | None = None
+    ground_arms: np.ndarray = np.zeros((0, 3))
+    ground_variance: np.ndarray = np.zeros((0, 2))
 
 
 class Estimate(NamedTuple):
-    """Estimate of a state (L, 13) at a time [s], and the covariance (n, n) of the errors of its coordinates."""
+    """Estimate of a state (L, 13) at a time [s].
+
+    covariance (n + m, n + m): of the errors of its coordinates and of m biases. bias (m,): of sensors.
+    """
 
     time: float
     state: np.ndarray
     covariance: np.ndarray
+    bias: np.ndarray = np.zeros(0)
 
 
 class Estimator(Protocol):
     """Estimator of the state: a pair of pure functions."""
 
     def init(self, state: np.ndarray, variance: np.ndarray, time: float) -> Estimate:
-        """Return the estimate before anything is measured: a state (L, 13), and the variance (n,) of its errors."""
+        """Return the estimate before anything is measured: a state (L, 13), and the variance (n + m,) of its errors."""
 
     def update(
         self, estimate: Estimate, observation: Observation | None, control: np.ndarray | None, time: float
@@ -104,25 +116,31 @@ class LastSample:
 class KalmanFilter:
     """The filter of the module.
 
-    dt: a step of the dynamics [s]. process_noise (n,): variance that a step adds to each coordinate, the diagonal of Q.
+    dt: a step of the dynamics [s]. process_noise (n,): variance that a step adds to each coordinate. change_error:
+    error of the change of a rate in a step, as a share of it. biased: numbers of the m coordinates that are measured
+    with an unknown bias.
     """
 
     dynamics: Coordinated
     dt: float
     process_noise: np.ndarray
+    change_error: float = 0.0
+    biased: Sequence[int] = ()
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.dt) and self.dt > 0.0):
-            raise InputError(f"dt: got {self.dt}, needs a finite number > 0")
+        for name, value, least in (("dt", self.dt, 1e-9), ("change_error", self.change_error, 0.0)):
+            if not least <= value < math.inf:
+                raise InputError(f"{name}: got {value}, needs a finite number {'> 0' if least else '>= 0'}")
         if not np.all(np.isfinite(self.process_noise) & (np.asarray(self.process_noise) >= 0.0)):
             raise InputError("process_noise: got numbers that are not finite or negative, needs variances")
 
     def init(self, state: np.ndarray, variance: np.ndarray, time: float) -> Estimate:
         """See `Estimator`."""
-        variance = np.asarray(variance, float)
-        if variance.shape != np.shape(self.process_noise) or not np.all(np.isfinite(variance) & (variance >= 0.0)):
-            raise InputError(f"variance: needs {len(self.process_noise)} finite numbers >= 0, of the coordinates")
-        return Estimate(time, np.asarray(state, float), np.diag(variance))
+        variance, biases = np.asarray(variance, float), len(self.biased)
+        count = len(self.process_noise) + biases
+        if variance.shape != (count,) or not np.all(np.isfinite(variance) & (variance >= 0.0)):
+            raise InputError(f"variance: needs {count} finite numbers >= 0, of the coordinates")
+        return Estimate(time, np.asarray(state, float), np.diag(variance), np.zeros(biases))
 
     def update(
         self, estimate: Estimate, observation: Observation | None, control: np.ndarray | None, time: float
@@ -140,48 +158,108 @@ class KalmanFilter:
         return estimate._replace(time=time)
 
     def _predicted(self, estimate: Estimate, control: Any) -> Estimate:
-        arrays = (jnp.asarray(array, jnp.float32) for array in (estimate.state, control))
-        state = np.array(self._predict(*arrays), float)
+        state, change = (
+            np.asarray(array, float)
+            for array in self._predict(*(np.asarray(array, np.float32) for array in (estimate.state, control)))
+        )
         if not np.isfinite(state).all():
             raise InputError(
                 "state: the model's step from the estimate is not finite, so that nothing can be predicted"
             )
-        transition = np.eye(len(estimate.covariance))
-        half = len(transition) // 2
-        transition[:half, half:] = self.dt * np.eye(half)
-        covariance = transition @ estimate.covariance @ transition.T + np.diag(self.process_noise)
+        half, count = len(change), len(self.process_noise)
+        covariance = estimate.covariance.copy()
+        covariance[:half] += self.dt * estimate.covariance[half:count]
+        covariance[:, :half] += self.dt * covariance[:, half:count]
+        noise = np.array(self.process_noise, float)
+        noise[half:] += (self.change_error * change) ** 2
+        covariance[np.arange(count), np.arange(count)] += noise
         return estimate._replace(state=state, covariance=covariance)
 
     def _corrected(self, estimate: Estimate, observation: Observation) -> Estimate:
-        count, half = len(estimate.covariance), len(estimate.covariance) // 2
-        age = np.broadcast_to(np.asarray(observation.age, float), (count,))
-        if not np.all(age >= 0.0):
-            raise InputError("observation: got an age below 0, needs measurements of the past")
-        by_state = np.eye(count)
-        by_state[:half, half:] = -np.diag(age[:half])
-        past = _difference(self.dynamics, observation.state, estimate.state)
-        past[:half] += age[:half] * rates(self.dynamics, estimate.state)
-        (measured,) = np.nonzero(np.isfinite(observation.variance))
-        innovation, by_state, noise = past[measured], by_state[measured], observation.variance[measured]
-        (links,) = np.nonzero(np.isfinite(observation.place_variance))
-        if len(links):
-            basis = np.asarray(self.dynamics.basis(jnp.asarray(estimate.state, jnp.float32)[None])[0], float)
-            distance = observation.places[links] - estimate.state[links, packed.POSITION]
-            innovation = np.concatenate([innovation, distance.ravel()])
-            by_state = np.concatenate([by_state, basis[links, packed.POSITION].reshape(-1, count)])
-            noise = np.concatenate([noise, np.repeat(observation.place_variance[links], 3)])
+        deviation, basis = (
+            np.asarray(array, float)
+            for array in self._compare(
+                *(np.asarray(array, np.float32) for array in (estimate.state, observation.state))
+            )
+        )
+        count = len(estimate.covariance)
+        parts = [self._of_coordinates(observation, deviation, estimate)]
+        if np.isfinite(observation.place_variance).any():
+            parts.append(_of_places(observation, estimate.state, basis))
+        if np.isfinite(observation.ground_variance).any():
+            parts.append(_of_ground(observation, estimate.state, basis))
+        innovation, noise = (np.concatenate([part[index] for part in parts]) for index in (0, 2))
+        by_state = np.concatenate([np.pad(part[1], ((0, 0), (0, count - part[1].shape[1]))) for part in parts])
         noise = np.maximum(noise, LEAST_VARIANCE)
         covariance = estimate.covariance
         total = by_state @ covariance @ by_state.T + np.diag(noise)
         gain = np.linalg.solve(total, by_state @ covariance).T
         rest = np.eye(count) - gain @ by_state
         covariance = rest @ covariance @ rest.T + (gain * noise) @ gain.T
-        return estimate._replace(state=moved(self.dynamics, estimate.state, gain @ innovation), covariance=covariance)
+        change, states = gain @ innovation, len(self.process_noise)
+        state = moved(self.dynamics, estimate.state, change[:states])
+        return estimate._replace(state=state, covariance=covariance, bias=estimate.bias + change[states:])
+
+    def _of_coordinates(self, observation: Observation, deviation: np.ndarray, estimate: Estimate) -> Measured:
+        by_state = np.eye(len(deviation), len(estimate.covariance))
+        by_state[list(self.biased), len(deviation) + np.arange(len(self.biased))] = 1.0
+        innovation = deviation.copy()
+        innovation[list(self.biased)] -= estimate.bias
+        (measured,) = np.nonzero(np.isfinite(observation.variance))
+        return innovation[measured], by_state[measured], observation.variance[measured]
 
     @cached_property
     def _predict(self) -> Any:
-        """Return the compiled step (state, control) -> state."""
-        return jax.jit(lambda state, control: self.dynamics.rollout(state[None], control[None, None])[0, 0])
+        """Return the compiled step (state, control) -> the next state, and the changes (n / 2,) of rates."""
+
+        def predict(state: jax.Array, control: jax.Array) -> tuple[jax.Array, jax.Array]:
+            following = self.dynamics.rollout(state[None], control[None, None])[:, 0]
+            before, after = (_rates(self.dynamics, states) for states in (state[None], following))
+            return following[0], (after - before)[0]
+
+        return jax.jit(predict)
+
+    @cached_property
+    def _compare(self) -> Any:
+        """Return the compiled function (state, measured) -> coordinates (n,) of the latter, basis (L, 13, n)."""
+
+        def compare(state: jax.Array, measured: jax.Array) -> tuple[jax.Array, jax.Array]:
+            return self.dynamics.difference(measured[None], state[None])[0], self.dynamics.basis(state[None])[0]
+
+        return jax.jit(compare)
+
+
+Measured = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Of M numbers: innovations (M,), their derivatives (M, n) by the coordinates, the variances (M,) of their errors."""
+
+
+def _of_places(observation: Observation, state: np.ndarray, basis: np.ndarray) -> Measured:
+    (links,) = np.nonzero(np.isfinite(observation.place_variance))
+    places, by_state = state[links, packed.POSITION], basis[links, packed.POSITION]
+    if (origin := observation.origin) is not None:
+        arms, quaternion, by_turn = places - state[origin, packed.POSITION], state[origin, 3:7], basis[origin, 3:7]
+        w, v = quaternion[0], quaternion[1:]
+        turn = 2.0 * (w * by_turn[1:] - np.outer(v, by_turn[0]) - np.cross(by_turn[1:], v, axis=0))
+        axes = Rotation.from_quat(np.r_[v, w]).as_matrix()
+        # The axes turn with the link: what rests in the world moves backwards in them.
+        by_state = by_state - basis[origin, packed.POSITION] + np.cross(arms[:, :, None], turn[None], axis=1)
+        places, by_state = arms @ axes, np.einsum("lin,ij->ljn", by_state, axes)
+    innovation = observation.places[links] - places
+    count = by_state.shape[-1]
+    return innovation.ravel(), by_state.reshape(-1, count), np.repeat(observation.place_variance[links], 3)
+
+
+def _of_ground(observation: Observation, state: np.ndarray, basis: np.ndarray) -> Measured:
+    links = np.isfinite(observation.ground_variance).all(axis=1)
+    arms, variance = observation.ground_arms[links], observation.ground_variance[links]
+    position, velocity, spin = (
+        (state[links, part], basis[links, part]) for part in (packed.POSITION, packed.VELOCITY, packed.ANGULAR_VELOCITY)
+    )
+    heights, speeds = position[0][:, 2] + arms[:, 2], velocity[0] + np.cross(spin[0], arms)
+    by_state = np.concatenate([position[1][:, 2:], velocity[1] + np.cross(spin[1], arms[:, :, None], axis=1)], axis=1)
+    innovation = -np.concatenate([heights[:, None], speeds], axis=1)
+    count = by_state.shape[-1]
+    return innovation.ravel(), by_state.reshape(-1, count), np.repeat(variance, (1, 3), axis=1).ravel()
 
 
 def moved(dynamics: Coordinated, state: np.ndarray, coordinates: np.ndarray) -> np.ndarray:
@@ -198,10 +276,12 @@ def _difference(dynamics: Coordinated, state: np.ndarray, reference: np.ndarray)
 
 def rates(dynamics: Coordinated, state: np.ndarray) -> np.ndarray:
     """Return the rates (n / 2,) among the coordinates of a state (L, 13) against the same one at rest."""
-    at_rest = np.array(state)
-    at_rest[:, packed.VELOCITY.start :] = 0.0
-    coordinates = _difference(dynamics, state, at_rest)
-    return coordinates[len(coordinates) // 2 :]
+    return np.array(_rates(dynamics, jnp.asarray(state, jnp.float32)[None])[0], float)
+
+
+def _rates(dynamics: Coordinated, states: jax.Array) -> jax.Array:
+    coordinates = dynamics.difference(states, states.at[..., packed.VELOCITY.start :].set(0.0))
+    return coordinates[..., coordinates.shape[-1] // 2 :]
 
 
 def _require_time(estimate: Estimate, time: float) -> None:

@@ -1,66 +1,47 @@
-"""Sensors between the ground truth and the planner, by name, and estimation of the state from what they measure."""
+"""Estimates of true states from what sensors measure of them, for the planner."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from larp_model import state as packed
+from larp_model.errors import InputError
 from larp_model.names import require_known
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
+from mpc.dynamics import Coordinated
 from mpc.estimator import Estimate, Estimator, KalmanFilter, LastSample, Observation, moved, rates
+from mpc.timeline import Timeline
+from tasks.sensors import PERFECT, SENSORS, SensorModel, SensorName, Sensors, biased_coordinates
 
-SensorName = Literal["perfect", "noisy", "lab"]
 EstimatorName = Literal["none", "filter"]
-
-
-@dataclass(frozen=True)
-class Sensors:
-    """Standard deviations of the errors of measurements, independent in every step.
-
-    root: of the place of a human's root [m]; turn: of its orientation about each axis [rad]; joints: of joint angles
-    about each axis [rad]; ball: of a ball's place [m]; places: of the centres of all links of a human [m], None: they
-    are not measured. velocities: of all velocities and angular velocities, as shares of themselves; None: they are not
-    measured.
-    """
-
-    root: float = 0.0
-    turn: float = 0.0
-    joints: float = 0.0
-    ball: float = 0.0
-    places: float | None = None
-    velocities: float | None = 0.0
-
-
-PERFECT = Sensors()
-SENSORS: dict[str, Sensors] = {
-    "perfect": PERFECT,
-    "noisy": Sensors(joints=math.radians(0.5), ball=0.005, velocities=0.02),
-    # Motion capture: every link to a millimetre and half a degree, and no sensor of velocities.
-    "lab": Sensors(0.001, math.radians(0.5), math.radians(0.5), 0.001, places=0.001, velocities=None),
-}
+ESTIMATORS: tuple[EstimatorName, ...] = ("none", "filter")
+# Time for which sensors measure before the first plan, while all bodies move uniformly [s].
+BEFORE = 1.0
 
 
 @dataclass(frozen=True)
 class ModelErrors:
     """Standard deviations of what the model does not explain of a step, or of what is unknown of the start.
 
-    Of places [m], angles [rad], velocities [m/s] and angular velocities [rad/s], of a human and of a ball. vertical: of
-    a ball's vertical velocity [m/s].
+    Of places [m], angles [rad], velocities [m/s] and angular velocities [rad/s], of a human and of a ball.
     """
 
     human: tuple[float, float, float, float]
     ball: tuple[float, float, float, float]
-    vertical: float
 
 
-# A measured place slightly in the ground, or above it, makes the model lift the ball, or drop it.
-STEP = ModelErrors((0.0, 0.0, 0.01, 0.1), (0.0, 0.0, 0.002, 0.1), 0.1)
-START = ModelErrors((0.02, 0.05, 0.2, 0.5), (0.1, 1.0, 1.0, 10.0), 1.0)
+# A measured place slightly in the ground, or above it, makes the model lift the ball, or drop it: changes of velocities
+# are uncertain by a share.
+STEP, CHANGE_ERROR = ModelErrors((0.0, 0.0, 0.01, 0.1), (0.0, 0.0, 0.0003, 0.1)), 0.1
+UNIFORM = ModelErrors((0.0, 0.0, 0.0, 0.01), (0.0, 0.0, 0.0003, 0.1))
+START = ModelErrors((0.01, 0.02, 0.03, 0.1), (0.1, 1.0, 1.0, 10.0))
 
 
 def of_coordinates(scene: Scene, errors: ModelErrors) -> np.ndarray:
@@ -70,83 +51,132 @@ def of_coordinates(scene: Scene, errors: ModelErrors) -> np.ndarray:
         place, angle, velocity, angular_velocity = errors.ball if body.is_ball else errors.human
         turns = len(body.links)
         halves[0].extend([place] * 3 + [angle] * 3 * turns)
-        halves[1].extend([velocity] * 2 + [errors.vertical if body.is_ball else velocity])
-        halves[1].extend([angular_velocity] * 3 * turns)
+        halves[1].extend([velocity] * 3 + [angular_velocity] * 3 * turns)
     return np.square(np.concatenate(halves))
 
 
-class SensorModel:
-    """Sensors of a scene, which measure true states."""
+@dataclass(frozen=True)
+class Uniform:
+    """Dynamics in which all rates stay as they are; joint targets have no effect."""
 
-    def __init__(self, scene: Scene, sensors: Sensors, random: np.random.Generator) -> None:
-        """Begin; random: of the errors."""
-        self.dynamics = Simulator.of_physics(scene)
-        self._sensors, self._random = sensors, random
-        positions: list[float] = []
-        for body in scene.bodies:
-            # The orientation of a ball is not measured, and does not matter.
-            own = (sensors.ball, math.inf) if body.is_ball else (sensors.root, sensors.turn)
-            positions += [own[0]] * 3 + [own[1]] * 3 + [sensors.joints] * 3 * (len(body.links) - 1)
-        self._positions = np.array(positions)
-        self._human = np.concatenate([np.full(len(body.links), not body.is_ball) for body in scene.bodies])
+    dynamics: Coordinated
+    dt: float
+    differentiable: ClassVar[bool] = True
 
-    def measure(self, state: np.ndarray) -> Observation:
-        """Return the measurement of a true state (L, 13)."""
-        errors = self._errors(state)
-        noise = np.where(np.isfinite(errors), errors, 0.0) * self._random.standard_normal(len(errors))
-        measured = moved(self.dynamics, state, noise)
-        observation = Observation(measured, self._errors(measured) ** 2)
-        if (places := self._sensors.places) is None:
-            return observation
-        centres = state[:, packed.POSITION] + places * self._random.standard_normal((len(state), 3))
-        return observation._replace(places=centres, place_variance=np.where(self._human, places**2, math.inf))
+    def rollout(self, state: jax.Array, controls: jax.Array, *, steps: jax.Array | None = None) -> jax.Array:
+        """See `mpc.Dynamics`."""
+        states = [state]
+        for _ in range(controls.shape[1]):
+            at_rest = states[-1].at[..., packed.VELOCITY.start :].set(0.0)
+            speeds = self.dynamics.difference(states[-1], at_rest)
+            half = speeds.shape[-1] // 2
+            change = jnp.concatenate([self.dt * speeds[..., half:], jnp.zeros_like(speeds[..., half:])], axis=-1)
+            states.append(self.dynamics.moved(states[-1], change))
+        return jnp.stack(states[1:], axis=1)
 
-    def _errors(self, state: np.ndarray) -> np.ndarray:
-        """Return the standard deviations (n,) of the coordinates of a state, inf where nothing is measured."""
-        share = self._sensors.velocities
-        unknown = np.full_like(self._positions, math.inf)
-        return np.concatenate(
-            [self._positions, unknown if share is None else share * np.abs(rates(self.dynamics, state))]
-        )
+    def difference(self, states: jax.Array, references: jax.Array) -> jax.Array:
+        """See `mpc.dynamics.Coordinated`."""
+        return self.dynamics.difference(states, references)
+
+    def moved(self, states: jax.Array, coordinates: jax.Array) -> jax.Array:
+        """See `mpc.dynamics.Coordinated`."""
+        return self.dynamics.moved(states, coordinates)
+
+    def basis(self, states: jax.Array) -> jax.Array:
+        """See `mpc.dynamics.Coordinated`."""
+        return self.dynamics.basis(states)
+
+
+@dataclass(frozen=True)
+class _FromTheStart:
+    """Estimator that is another one until time 0."""
+
+    before: Estimator
+    after: Estimator
+
+    def init(self, state: np.ndarray, variance: np.ndarray, time: float) -> Estimate:
+        """See `mpc.estimator.Estimator`."""
+        return self.before.init(state, variance, time)
+
+    def update(
+        self, estimate: Estimate, observation: Observation | None, control: np.ndarray | None, time: float
+    ) -> Estimate:
+        """See `mpc.estimator.Estimator`."""
+        return (self.before if time <= 1e-9 else self.after).update(estimate, observation, control, time)
 
 
 @dataclass
 class Perception:
     """Estimates of true states from measurements of them, step by step, for the planner: see `mpc.loop.Sense`.
 
-    estimates: of all steps so far.
+    estimates: of all steps so far. lost: the steps in which nothing was measured, so that the estimate is a prediction.
     """
 
     sensors: SensorModel
-    estimator: Estimator
-    start: Estimate
+    timeline: Timeline
     dt: float
     estimates: list[Estimate] = field(default_factory=list)
+    lost: int = 0
+    first_step: int | None = None
 
     def __call__(self, step: int, state: np.ndarray, control: np.ndarray | None) -> np.ndarray:
         """Return the estimate of a true state (L, 13) after joint targets (J, 3) [rad] in the step before."""
-        last = self.estimates[-1] if self.estimates else self.start._replace(time=step * self.dt)
-        observation = self.sensors.measure(state)
-        self.estimates.append(self.estimator.update(last, observation, control, step * self.dt))
+        if self.first_step is None:
+            self.first_step, control = step, None
+        time = (step - self.first_step) * self.dt
+        samples = self.sensors.measure(state, time)
+        self.lost += not samples
+        self.estimates.append(self.timeline.update(samples, control, time))
         return self.estimates[-1].state
 
 
-def estimator_of(scene: Scene, name: EstimatorName) -> Estimator:
-    """Return an estimator of a scene's states by its name; it compiles its prediction once."""
-    require_known("estimator", name, ("none", "filter"))
-    dynamics = Simulator.of_physics(scene)
-    return LastSample(dynamics) if name == "none" else KalmanFilter(dynamics, scene.dt, of_coordinates(scene, STEP))
+class Sensing:
+    """Sensors and an estimator of a scene's states; what they need is compiled once, for any number of perceptions."""
 
+    def __init__(self, scene: Scene, sensors: SensorName | Sensors, estimator: EstimatorName = "filter") -> None:
+        """Set up. sensors, estimator: names, or sensors of your own."""
+        require_known("estimator", estimator, ESTIMATORS)
+        if isinstance(sensors, str):
+            require_known("sensors", sensors, SENSORS)
+            sensors = SENSORS[sensors]
+        self.scene, self.sensors = scene, sensors
+        if any(body.is_ball for body in scene.bodies) and math.isinf(sensors.ball) and sensors.camera is None:
+            raise InputError("sensors: got none that measures the ball, needs its place (ball) or a camera")
+        if estimator == "none" and (math.isinf(sensors.root) or math.isinf(sensors.ball)):
+            raise InputError("estimator: got 'none', but not all places are measured at once: needs 'filter'")
+        self._dynamics = Simulator.of_physics(scene)
+        self._biased = biased_coordinates(scene, sensors) if estimator == "filter" else []
+        self._estimator: Estimator = LastSample(self._dynamics)
+        if estimator == "filter":
+            filters = (
+                KalmanFilter(dynamics, scene.dt, of_coordinates(scene, errors), CHANGE_ERROR, self._biased)
+                for dynamics, errors in ((Uniform(self._dynamics, scene.dt), UNIFORM), (self._dynamics, STEP))
+            )
+            self._estimator = _FromTheStart(*filters)
 
-def perception(
-    scene: Scene, start: np.ndarray, sensors: SensorName, estimator: Estimator, random: np.random.Generator
-) -> Perception | None:
-    """Return a perception of a scene's states by sensors of this name, None where they are perfect.
+    def perception(self, start: np.ndarray, random: np.random.Generator) -> Perception | None:
+        """Return a perception of states from `start` (L, 13) on; None where the sensors are perfect.
 
-    start (L, 13): the state that is expected at first. random: of the sensors' errors.
-    """
-    require_known("sensors", sensors, SENSORS)
-    if SENSORS[sensors] == PERFECT:
-        return None
-    model = SensorModel(scene, SENSORS[sensors], random)
-    return Perception(model, estimator, estimator.init(start, of_coordinates(scene, START), 0.0), scene.dt)
+        The sensors have measured for `BEFORE` seconds by then. random: of their errors, and of what was expected first.
+        """
+        if self.sensors == PERFECT:
+            return None
+        dt, dynamics = self.scene.dt, self._dynamics
+        speeds, no_control = rates(dynamics, start), np.zeros((len(self.scene.motors), 3))
+        variance = of_coordinates(self.scene, START)
+        sensors = SensorModel(self.scene, dynamics, self.sensors, random)
+
+        def state_before(time: float) -> np.ndarray:
+            return moved(dynamics, start, np.concatenate([time * speeds, np.zeros_like(speeds)]))
+
+        steps = round(BEFORE / dt)
+        errors = np.sqrt(variance) * random.standard_normal(len(variance))
+        expected = moved(dynamics, state_before(-steps * dt), errors)
+        first = np.concatenate([variance, np.full(len(self._biased), self.sensors.bias**2)])
+        estimator = self._estimator
+        timeline = Timeline(estimator, estimator.init(expected, first, -steps * dt))
+        for step in range(-steps, 1):
+            time, control = step * dt, None if step == -steps else no_control
+            samples = sensors.measure(state_before(time), time) if step else []
+            timeline.update(samples, control, time)
+        return Perception(sensors, timeline, dt)

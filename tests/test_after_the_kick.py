@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from larp_model import state as packed
 from larp_model.engines.mujoco import Truth
 from larp_model.physics import kinematics
+from larp_model.simulator import Simulator
 from mpc import evaluate
-from tasks import kick, sensing
+from tasks import kick, sensing, sensors
 from tasks.gap import events, gap
 from tasks.motions.references import standing_on_ground
 from tasks.standing import HORIZON, SWING_END, Standing
@@ -129,24 +130,23 @@ def test_a_rolling_ball_is_where_it_would_rest_when_the_reference_strikes(task: 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sensors", ["noisy", "lab"])
+@pytest.mark.parametrize("name", ["noisy", "lab"])
 def test_the_filter_sees_the_kick_better_than_its_sensors_and_says_how_well(
-    task: kick.Kick, sensors: sensing.SensorName
+    task: kick.Kick, name: sensors.SensorName
 ) -> None:
-    estimators = [sensing.estimator_of(task.scene, name) for name in ("none", "filter")]
     start, truth = task.start((0.02, -0.01)), Truth(task.scene, 1, task.substeps, threads=1)
     raw, filtered = (
-        sensing.perception(task.scene, task.start(), sensors, estimator, np.random.default_rng(1))
-        for estimator in estimators
+        sensing.Sensing(task.scene, name, estimator).perception(start, np.random.default_rng(1))
+        for estimator in sensing.ESTIMATORS
     )
     assert raw is not None and filtered is not None
     truth.reset(start[None])
     window, state, control = task.window((4.0, 0.0, 0.5)), start, None
-    joints, ball = np.arange(6, 42), np.arange(42, 45)
+    joints, ball, simulator = np.arange(6, 42), np.arange(42, 45), Simulator.of_physics(task.scene)
     errors = []
     for step in range(task.reference.strike - 1):
         deviations = [
-            np.asarray(raw.sensors.dynamics.difference(state.astype(np.float32), each(step, state, control)))
+            np.asarray(simulator.difference(state.astype(np.float32), each(step, state, control)))
             for each in (raw, filtered)
         ]
         errors.append(deviations)
@@ -166,9 +166,10 @@ def test_the_filter_sees_the_kick_better_than_its_sensors_and_says_how_well(
 
 
 def test_sensing_keeps_joints_closed_and_has_the_noise_it_says(task: kick.Kick) -> None:
-    sensors = sensing.SensorModel(task.scene, sensing.SENSORS["noisy"], np.random.default_rng(0))
+    simulator, random = Simulator.of_physics(task.scene), np.random.default_rng(0)
+    model = sensors.SensorModel(task.scene, simulator, sensors.SENSORS["noisy"], random)
     state = task.reference.states[25].astype(float)
-    seen = np.stack([sensors.measure(state).state for _ in range(200)])
+    seen = np.stack([model.measure(state, 0.0)[0].observation.state for _ in range(200)])
     shape = kinematics.morphology_of(task.scene)[None]
     apart = kinematics.displacement(task.scene, jnp.asarray(seen), shape)
     assert float(jnp.abs(apart).max()) < 1e-5

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import jax
@@ -15,7 +16,8 @@ from larp_model.physics.kinematics import displacement, morphology_of
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from mpc.estimator import Estimate, Estimator, KalmanFilter, LastSample, Observation, moved
-from tasks import sensing
+from mpc.timeline import Sample, Timeline
+from tasks import sensing, sensors
 from tasks.motions.references import Reference
 
 DT, UNKNOWN = 0.01, np.inf
@@ -52,11 +54,11 @@ def sled_filter(noise: float = 0.0) -> KalmanFilter:
     return KalmanFilter(Sled(), DT, np.r_[np.zeros(3), np.full(3, noise**2)])
 
 
-def seen(place: np.ndarray, error: float, age: float = 0.0) -> Observation:
+def seen(place: np.ndarray, error: float) -> Observation:
     """A measured place with errors of this size, and no velocity."""
     state = STATE.copy()
     state[0, :3] = place
-    return Observation(state, np.r_[np.full(3, error**2), np.full(3, UNKNOWN)], age)
+    return Observation(state, np.r_[np.full(3, error**2), np.full(3, UNKNOWN)])
 
 
 def paths(random: np.random.Generator, kicks: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
@@ -125,14 +127,66 @@ def test_what_is_lost_is_predicted_and_the_filter_becomes_less_sure() -> None:
 def test_an_old_measurement_counts_for_where_the_body_was() -> None:
     state, estimator = STATE.copy(), sled_filter()
     state[0, 7] = 2.0
-    certain = estimator.init(state, np.r_[np.ones(3), np.full(3, 1e-8)], 0.0)
-    old = estimator.update(certain, seen(np.array([-0.08, 0.0, 0.0]), 1e-4, age=0.04), None, 0.0)
-    np.testing.assert_allclose(old.state[0, :3], 0.0, atol=1e-4)
+    timeline = Timeline(estimator, estimator.init(state, np.r_[np.ones(3), np.full(3, 1e-8)], 0.0))
+    for step in range(5):
+        timeline.update([], np.zeros((1, 3)) if step else None, step * DT)
+    late = timeline.update([Sample(0.0, seen(np.array([-0.08, 0.0, 0.0]), 1e-4))], None, 4 * DT)
+    np.testing.assert_allclose(late.state[0, :3], 0.0, atol=1e-4)
+
+
+def test_late_samples_change_nothing_of_the_estimate_in_whatever_order_they_come() -> None:
+    random = np.random.default_rng(0)
+    states, controls = paths(random, 0.02, 12)
+    samples = [
+        Sample(step * DT, seen(states[step, 0, :3] + 0.01 * random.standard_normal(3), 0.01)) for step in range(13)
+    ]
+    deliveries = {
+        "at once": {step: [sample] for step, sample in enumerate(samples)},
+        "late": {step + 4: [sample] for step, sample in enumerate(samples[:9])} | {12: samples[8:]},
+        "in one": {12: [samples[number] for number in random.permutation(13)]},
+    }
+    estimates = []
+    for delivered in deliveries.values():
+        timeline = Timeline(sled_filter(0.02), sled_filter().init(STATE, 0.01 * ONES, 0.0))
+        for step in range(13):
+            estimate = timeline.update(delivered.get(step, []), controls[step - 1] if step else None, step * DT)
+        estimates.append(estimate)
+    for other in estimates[1:]:
+        np.testing.assert_allclose(other.state, estimates[0].state, atol=1e-6)
+        np.testing.assert_allclose(other.covariance, estimates[0].covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_samples_of_the_future_and_of_a_past_that_is_forgotten_are_refused() -> None:
+    estimator = sled_filter()
+    timeline = Timeline(estimator, estimator.init(STATE, ONES, 0.0))
+    for step in range(40):
+        timeline.update([], np.zeros((1, 3)) if step else None, step * DT)
+    before = timeline.estimate
+    with pytest.raises(InputError, match=r"sample: is of 0.41 s, but it is 0.4 s: needs one of the past"):
+        timeline.update([Sample(0.41, seen(np.zeros(3), 0.01))], np.zeros((1, 3)), 0.4)
+    with pytest.raises(InputError, match=r"sample: is of 0.1 s, but it is 0.4 s: needs one of the last 0.2 s"):
+        timeline.update([Sample(0.1, seen(np.zeros(3), 0.01))], np.zeros((1, 3)), 0.4)
+    with pytest.raises(InputError, match=r"time: got 0.3 s, needs a time from that of the estimate"):
+        timeline.update([], np.zeros((1, 3)), 0.3)
+    assert timeline.estimate is before
+
+
+def test_a_bias_is_the_mean_difference_from_a_sensor_without_one() -> None:
+    random, bias = np.random.default_rng(0), np.array([0.05, -0.03, 0.02])
+    estimator = KalmanFilter(Sled(), DT, np.zeros(6), biased=range(3))
+    estimate, differences = estimator.init(STATE, np.full(9, 0.01), 0.0), []
+    for step in range(1, 101):
+        place, unbiased = bias + 0.01 * random.standard_normal(3), 0.01 * random.standard_normal((1, 3))
+        differences.append(place - unbiased[0])
+        observation = seen(place, 0.01)._replace(places=unbiased, place_variance=np.array([1e-4]))
+        estimate = estimator.update(estimate, observation, np.zeros((1, 3)), step * DT)
+    np.testing.assert_allclose(estimate.bias, np.mean(differences, axis=0), atol=1e-4)
+    np.testing.assert_allclose(np.diag(estimate.covariance)[6:], 2e-6, rtol=0.05)
 
 
 def test_places_of_links_are_measurements_of_their_own() -> None:
     estimator, unmeasured = sled_filter(), np.full(6, UNKNOWN)
-    observation = Observation(STATE, unmeasured, 0.0, np.array([[0.3, 0.0, 0.1]]), np.array([1e-6]))
+    observation = Observation(STATE, unmeasured, np.array([[0.3, 0.0, 0.1]]), np.array([1e-6]))
     estimate = estimator.update(estimator.init(STATE, ONES, 0.0), observation, None, 0.0)
     np.testing.assert_allclose(estimate.state[0, :3], (0.3, 0.0, 0.1), atol=1e-5)
     np.testing.assert_allclose(np.diag(estimate.covariance)[:3], 1e-6, rtol=1e-2)
@@ -148,8 +202,8 @@ def test_clocks_and_measurements_that_mean_nothing_are_refused() -> None:
         estimator.update(now, None, control, 1.004)
     with pytest.raises(InputError, match=r"time: got 1.01 s after 1.0 s, needs steps of 0.01 s under control"):
         estimator.update(now, None, None, 1.01)
-    with pytest.raises(InputError, match=r"observation: got an age below 0, needs measurements of the past"):
-        estimator.update(now, seen(np.zeros(3), 0.01, age=-0.01), None, 1.0)
+    with pytest.raises(InputError, match=r"change_error: got nan, needs a finite number >= 0"):
+        KalmanFilter(Sled(), DT, ONES, np.nan)
     with pytest.raises(InputError, match=r"variance: needs 6 finite numbers >= 0"):
         estimator.init(STATE, np.full(6, UNKNOWN), 0.0)
     with pytest.raises(InputError, match=r"process_noise: got numbers that are not finite or negative"):
@@ -170,12 +224,94 @@ def test_a_moved_state_has_its_joints_closed_and_gives_the_coordinates_back(scen
     np.testing.assert_allclose(back, coordinates, atol=2e-3)
 
 
+@pytest.mark.parametrize("kind", ["places", "ground"])
+def test_an_estimate_agrees_with_what_was_measured_exactly(scene: Scene, reference: Reference, kind: str) -> None:
+    simulator, random = Simulator.of_physics(scene), np.random.default_rng(0)
+    state, count = np.asarray(reference.states[20], float), 2 * Coordinates(scene).count
+    other = moved(simulator, state, 0.01 * random.standard_normal(count))
+    links, ball = len(scene.links), scene.rows(scene.ball.name).start
+
+    arms = np.zeros((links, 3))
+    arms[:, 2] = -scene.links[ball].radius
+
+    def measured(states: np.ndarray) -> np.ndarray:
+        if kind == "places":
+            arm = states[ball, :3] - states[0, :3]
+            return np.array(sensors.rotations(states[0]).inv().apply(arm))
+        speed = states[ball, 7:10] + np.cross(states[ball, 10:], arms[ball])
+        return np.array([states[ball, 2] + arms[ball, 2], *speed])
+
+    only_ball = np.where(np.arange(links) == ball, 1e-8, UNKNOWN)
+    observation = Observation(state, np.full(count, UNKNOWN))
+    if kind == "places":
+        expected = measured(other)
+        observation = observation._replace(places=np.tile(expected, (links, 1)), place_variance=only_ball, origin=0)
+    else:
+        observation = observation._replace(ground_arms=arms, ground_variance=np.repeat(only_ball[:, None], 2, axis=1))
+        state, expected = other, np.zeros(4)
+    estimator = KalmanFilter(simulator, scene.dt, np.zeros(count))
+    estimate = estimator.update(estimator.init(state, np.full(count, 0.01), 0.0), observation, None, 0.0)
+    estimate = estimator.update(estimate, observation, None, 0.0)
+    before, after = (measured(each) - expected for each in (state, estimate.state))
+    assert np.abs(before).max() > 5e-3 and np.abs(after).max() < 5e-4
+
+
 def test_perfect_sensors_need_no_perception(scene: Scene, reference: Reference) -> None:
-    estimator, random = LastSample(Simulator.of_physics(scene)), np.random.default_rng(0)
-    assert sensing.perception(scene, reference.states[0], "perfect", estimator, random) is None
-    for name, arguments in {"sensors": ("blurred", estimator), "estimator": None}.items():
-        with pytest.raises(InputError, match=f"{name}"):
-            if arguments:
-                sensing.perception(scene, reference.states[0], *arguments, random)  # type: ignore[arg-type]
-            else:
-                sensing.estimator_of(scene, "crystal ball")  # type: ignore[arg-type]
+    random = np.random.default_rng(0)
+    assert sensing.Sensing(scene, "perfect", "none").perception(reference.states[0], random) is None
+
+
+def test_sensors_that_see_too_little_are_refused_by_name(scene: Scene) -> None:
+    for arguments, message in (
+        (("blurred",), "sensors"),
+        (("noisy", "crystal ball"), "estimator"),
+        (
+            (sensors.Sensors(ball=np.inf),),
+            r"sensors: got none that measures the ball, needs its place \(ball\) or a camera",
+        ),
+        (("onboard", "none"), "estimator: got 'none', but not all places are measured at once: needs 'filter'"),
+    ):
+        with pytest.raises(InputError, match=message):
+            sensing.Sensing(scene, *arguments)
+
+
+def test_pictures_arrive_late_at_their_rate_and_show_the_ball_from_the_root(scene: Scene, reference: Reference) -> None:
+    camera = sensors.BallCamera(noise=0.0, bounds=(0.0, 0.0), rate=25.0, delay=0.04, lost=0.0)
+    own = dataclasses.replace(sensors.SENSORS["onboard"], camera=camera, lost=0.0)
+    model = sensors.SensorModel(scene, Simulator.of_physics(scene), own, np.random.default_rng(0))
+    state = np.asarray(reference.states[10], float)
+    pictures = [
+        (step, sample)
+        for step in range(20)
+        for sample in model.measure(state, step * DT)
+        if sample.observation.origin is not None
+    ]
+    assert [step for step, _ in pictures] == [4, 8, 12, 16]
+    np.testing.assert_allclose([sample.time for _, sample in pictures], [0.0, 0.04, 0.08, 0.12], atol=1e-9)
+    ball, seen_ball = scene.rows(scene.ball.name).start, pictures[0][1].observation
+    in_world = sensors.rotations(state[0]).apply(seen_ball.places[ball]) + state[0, :3]
+    np.testing.assert_allclose(in_world, state[ball, :3], atol=1e-6)
+
+
+def test_where_all_measurements_are_lost_the_estimate_is_a_prediction_and_says_so(
+    scene: Scene, reference: Reference
+) -> None:
+    blind = dataclasses.replace(sensors.SENSORS["lab"], lost=1.0)
+    perceived = sensing.Sensing(scene, blind).perception(reference.states[0], np.random.default_rng(0))
+    assert perceived is not None
+    for step in range(3):
+        perceived(step, reference.states[step], None if not step else np.zeros((len(scene.motors), 3)))
+    assert perceived.lost == 3
+    assert np.all(np.diff([np.trace(estimate.covariance) for estimate in perceived.estimates]) > 0.0)
+
+
+def test_numbers_of_sensors_that_mean_nothing_are_refused() -> None:
+    for kind, arguments, message in (
+        (sensors.Sensors, {"joints": -0.1}, "joints: got -0.1, needs a number >= 0"),
+        (sensors.Sensors, {"lost": 1.5}, "lost: got 1.5, needs a number from 0 to 1"),
+        (sensors.BallCamera, {"rate": 0.0}, "camera.rate: got 0.0, needs a finite number > 0"),
+        (sensors.BallCamera, {"delay": np.nan}, "camera.delay: got nan, needs a number >= 0"),
+        (sensors.BallCamera, {"bounds": (0.03, 0.01)}, r"camera.bounds: got \(0.03, 0.01\), needs the lower one first"),
+    ):
+        with pytest.raises(InputError, match=message):
+            kind(**arguments)

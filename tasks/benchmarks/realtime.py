@@ -15,7 +15,6 @@ from rich.table import Table
 
 from larp_model.engines.mujoco import SUBSTEPS, Truth
 from larp_model.errors import InputError
-from mpc.estimator import Estimator
 from mpc.loop import Execution, Latency, World
 from mpc.realtime import PacedWorld, PlanningThread, SimulatedLatency
 from tasks.benchmarks import report
@@ -24,7 +23,8 @@ from tasks.kick import USUAL, Kick
 from tasks.models import DynamicsName
 from tasks.presets import PresetName, preset_of
 from tasks.run import plans_of, summary_of
-from tasks.sensing import EstimatorName, SensorName, estimator_of, perception
+from tasks.sensing import EstimatorName, Sensing
+from tasks.sensors import SensorName
 from tasks.session import Planners, Session
 from tasks.targets import random_kick, random_roll
 
@@ -137,7 +137,7 @@ class Sessions:
         self.settings, self.kick = settings, Kick.standard()
         self._sessions: dict[str, Session] = {}
         self._seconds: dict[tuple[str, str, int], list[float]] = {}
-        self._estimators: dict[str, Estimator] = {}
+        self._sensing: dict[tuple[str, str], Sensing] = {}
 
     def session(self, dynamics: DynamicsName) -> Session:
         """Return the session of a model."""
@@ -150,11 +150,12 @@ class Sessions:
         preset = replace(preset_of(point.preset), interval=point.interval)
         return self.session(point.dynamics).planners(preset)
 
-    def estimator(self, name: EstimatorName) -> Estimator:
-        """Return an estimator of the kick's states."""
-        if name not in self._estimators:
-            self._estimators[name] = estimator_of(self.kick.scene, name)
-        return self._estimators[name]
+    def sensing(self, point: RealtimePoint) -> Sensing:
+        """Return the sensors and the estimator of a point."""
+        key = point.sensors, point.estimator
+        if key not in self._sensing:
+            self._sensing[key] = Sensing(self.kick.scene, *key)
+        return self._sensing[key]
 
     def seconds(self, point: RealtimePoint) -> list[float]:
         """Return the times [s] that the plans of a kick took, after another kick that compiled all programs."""
@@ -180,11 +181,11 @@ def kick_row(
 ) -> report.Row:
     """Return the row of a kick: its summary, and what plans made of the time. See `kick.kick_row` for arguments."""
     settings, kick, seed = sessions.settings, sessions.kick, sessions.settings.seed + index
-    random = np.random.default_rng((settings.seed, index))
-    sense = perception(kick.scene, kick.start(), point.sensors, sessions.estimator(point.estimator), random)
+    start = kick.start(shift, roll)
+    sense = sessions.sensing(point).perception(start, np.random.default_rng((settings.seed, index)))
     latency, world = sessions.timing(point, seed)
     execution = sessions.session(point.dynamics).execute(
-        sessions.planners(point), target, seed, kick.start(shift, roll), sense=sense, world=world, latency=latency
+        sessions.planners(point), target, seed, start, sense=sense, world=world, latency=latency
     )
     timing_of_plans = timing_figures(execution, kick.scene.dt)
     return (
@@ -311,7 +312,8 @@ def main(
         dynamics: the planner's model: larp or mujoco.
         interval: steps between replans at least; those of the preset by default.
         substeps: engine steps in a step of MuJoCo as the model.
-        sensors: perfect; noisy: joint angles, velocities and the ball's place are; lab: motion capture.
+        sensors: perfect; noisy: joint angles, velocities and the ball's place are; lab: motion capture; onboard:
+            encoders, an inertial unit, contact switches and a camera.
         estimator: of the state: none, which takes the last measurement, or filter.
         rolling: greatest speed [m/s] of a ball that comes from ahead or from the kicking side; 0: it rests.
         json: where the figures go; the picture goes beside them.
