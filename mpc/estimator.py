@@ -154,7 +154,7 @@ class KalmanFilter:
             for _ in range(round(steps)):
                 estimate = self._predicted(estimate, control)
             if observation is not None:
-                estimate = self._corrected(estimate, observation)
+                estimate = self.corrected(estimate, observation)
         return estimate._replace(time=time)
 
     def _predicted(self, estimate: Estimate, control: Any) -> Estimate:
@@ -175,7 +175,8 @@ class KalmanFilter:
         covariance[np.arange(count), np.arange(count)] += noise
         return estimate._replace(state=state, covariance=covariance)
 
-    def _corrected(self, estimate: Estimate, observation: Observation) -> Estimate:
+    def corrected(self, estimate: Estimate, observation: Observation) -> Estimate:
+        """Return the estimate with what is measured at its time."""
         deviation, basis = (
             np.asarray(array, float)
             for array in self._compare(

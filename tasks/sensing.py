@@ -17,7 +17,7 @@ from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from mpc.dynamics import Coordinated
 from mpc.estimator import Estimate, Estimator, KalmanFilter, LastSample, Observation, moved, rates
-from mpc.timeline import Timeline
+from mpc.timeline import Sample, Timeline
 from tasks.sensors import PERFECT, SENSORS, SensorModel, SensorName, Sensors, biased_coordinates
 
 EstimatorName = Literal["none", "filter"]
@@ -88,11 +88,11 @@ class Uniform:
 
 
 @dataclass(frozen=True)
-class _FromTheStart:
-    """Estimator that is another one until time 0."""
+class FromTheStart:
+    """Filter that is another one until time 0."""
 
-    before: Estimator
-    after: Estimator
+    before: KalmanFilter
+    after: KalmanFilter
 
     def init(self, state: np.ndarray, variance: np.ndarray, time: float) -> Estimate:
         """See `mpc.estimator.Estimator`."""
@@ -109,12 +109,15 @@ class _FromTheStart:
 class Perception:
     """Estimates of true states from measurements of them, step by step, for the planner: see `mpc.loop.Sense`.
 
-    estimates: of all steps so far. lost: the steps in which nothing was measured, so that the estimate is a prediction.
+    start: the estimate before anything was measured. samples: that arrived in each step since then. estimates: of all
+    steps so far. lost: the steps in which nothing was measured, so that the estimate is a prediction.
     """
 
     sensors: SensorModel
     timeline: Timeline
     dt: float
+    start: Estimate
+    samples: list[list[Sample]] = field(default_factory=list)
     estimates: list[Estimate] = field(default_factory=list)
     lost: int = 0
     first_step: int | None = None
@@ -125,6 +128,7 @@ class Perception:
             self.first_step, control = step, None
         time = (step - self.first_step) * self.dt
         samples = self.sensors.measure(state, time)
+        self.samples.append(samples)
         self.lost += not samples
         self.estimates.append(self.timeline.update(samples, control, time))
         return self.estimates[-1].state
@@ -144,15 +148,15 @@ class Sensing:
             raise InputError("sensors: got none that measures the ball, needs its place (ball) or a camera")
         if estimator == "none" and (math.isinf(sensors.root) or math.isinf(sensors.ball)):
             raise InputError("estimator: got 'none', but not all places are measured at once: needs 'filter'")
-        self._dynamics = Simulator.of_physics(scene)
+        self.dynamics = Simulator.of_physics(scene)
         self._biased = biased_coordinates(scene, sensors) if estimator == "filter" else []
-        self._estimator: Estimator = LastSample(self._dynamics)
+        self.estimator: Estimator = LastSample(self.dynamics)
         if estimator == "filter":
             filters = (
                 KalmanFilter(dynamics, scene.dt, of_coordinates(scene, errors), CHANGE_ERROR, self._biased)
-                for dynamics, errors in ((Uniform(self._dynamics, scene.dt), UNIFORM), (self._dynamics, STEP))
+                for dynamics, errors in ((Uniform(self.dynamics, scene.dt), UNIFORM), (self.dynamics, STEP))
             )
-            self._estimator = _FromTheStart(*filters)
+            self.estimator = FromTheStart(*filters)
 
     def perception(self, start: np.ndarray, random: np.random.Generator) -> Perception | None:
         """Return a perception of states from `start` (L, 13) on; None where the sensors are perfect.
@@ -161,22 +165,24 @@ class Sensing:
         """
         if self.sensors == PERFECT:
             return None
-        dt, dynamics = self.scene.dt, self._dynamics
-        speeds, no_control = rates(dynamics, start), np.zeros((len(self.scene.motors), 3))
+        dt, steps = self.scene.dt, round(BEFORE / self.scene.dt)
         variance = of_coordinates(self.scene, START)
-        sensors = SensorModel(self.scene, dynamics, self.sensors, random)
-
-        def state_before(time: float) -> np.ndarray:
-            return moved(dynamics, start, np.concatenate([time * speeds, np.zeros_like(speeds)]))
-
-        steps = round(BEFORE / dt)
         errors = np.sqrt(variance) * random.standard_normal(len(variance))
-        expected = moved(dynamics, state_before(-steps * dt), errors)
-        first = np.concatenate([variance, np.full(len(self._biased), self.sensors.bias**2)])
-        estimator = self._estimator
-        timeline = Timeline(estimator, estimator.init(expected, first, -steps * dt))
+        expected = moved(self.dynamics, uniform(self.dynamics, start, -steps * dt), errors)
+        biases = np.full(len(self._biased), self.sensors.bias**2)
+        first = self.estimator.init(expected, np.concatenate([variance, biases]), -steps * dt)
+        model = SensorModel(self.scene, self.dynamics, self.sensors, random)
+        perception = Perception(model, Timeline(self.estimator, first), dt, first)
+        no_control = np.zeros((len(self.scene.motors), 3))
         for step in range(-steps, 1):
             time, control = step * dt, None if step == -steps else no_control
-            samples = sensors.measure(state_before(time), time) if step else []
-            timeline.update(samples, control, time)
-        return Perception(sensors, timeline, dt)
+            samples = model.measure(uniform(self.dynamics, start, time), time) if step else []
+            perception.timeline.update(samples, control, time)
+            perception.samples += [samples] if step else []
+        return perception
+
+
+def uniform(dynamics: Coordinated, state: np.ndarray, time: float) -> np.ndarray:
+    """Return the state (L, 13) to which uniform motion leads from a state (L, 13) in a time [s], before it if < 0."""
+    speeds = rates(dynamics, state)
+    return moved(dynamics, state, np.concatenate([time * speeds, np.zeros_like(speeds)]))

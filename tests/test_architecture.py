@@ -158,6 +158,7 @@ ORDER = [
     "tasks.adapt",
     "tasks.benchmarks.report",
     "tasks.benchmarks.kick",
+    "tasks.benchmarks.estimation",
     "tasks.benchmarks.realtime",
     "tasks.benchmarks.gap",
     "tasks.benchmarks.model",

@@ -18,6 +18,7 @@ from larp_model.simulator import Simulator
 from mpc.estimator import Estimate, Estimator, KalmanFilter, LastSample, Observation, moved
 from mpc.timeline import Sample, Timeline
 from tasks import sensing, sensors
+from tasks.benchmarks.estimation import least_covariance
 from tasks.motions.references import Reference
 
 DT, UNKNOWN = 0.01, np.inf
@@ -315,3 +316,27 @@ def test_numbers_of_sensors_that_mean_nothing_are_refused() -> None:
     ):
         with pytest.raises(InputError, match=message):
             kind(**arguments)
+
+
+class LinearSled(Sled):
+    """The sled, with the derivatives of its steps."""
+
+    def linearize(self, states: jax.Array, controls: jax.Array) -> tuple[jax.Array, jax.Array]:
+        by_state = jnp.eye(6).at[:3, 3:].set(DT * jnp.eye(3))
+        return jnp.tile(by_state, (len(states), 1, 1)), jnp.zeros((len(states), 6, 3))
+
+
+def test_for_a_linear_model_the_filter_knows_as_much_as_the_cramer_rao_bound() -> None:
+    random, model = np.random.default_rng(0), LinearSled()
+    truth, controls = paths(random, 0.02, 20)
+    sled = KalmanFilter(model, DT, np.r_[np.zeros(3), np.full(3, 0.02**2)])
+    both = sensing.FromTheStart(sled, sled)
+    start = both.init(STATE, 0.01 * ONES, -0.05)
+    perceived = sensing.Perception(None, Timeline(both, start), DT, start)  # type: ignore[arg-type]
+    for step in range(-5, 21):
+        arrived = [Sample(step * DT, seen(STATE[0, :3], 0.01))] if step % 3 == 0 else []
+        perceived.samples.append(arrived)
+        control = None if step == -5 else controls[max(step - 1, 0)]
+        estimate = perceived.timeline.update(arrived, control, step * DT)
+    least = least_covariance(perceived, model, truth, controls, 20)  # type: ignore[arg-type]
+    np.testing.assert_allclose(least, estimate.covariance, rtol=1e-3, atol=1e-9)

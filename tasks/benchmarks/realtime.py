@@ -18,14 +18,16 @@ from larp_model.errors import InputError
 from mpc.loop import Execution, Latency, World
 from mpc.realtime import PacedWorld, PlanningThread, SimulatedLatency
 from tasks.benchmarks import report
+from tasks.benchmarks.estimation import EstimateErrors, errors_table, estimate_errors, mean_errors
 from tasks.command import prepare_jax, run
 from tasks.kick import USUAL, Kick
 from tasks.models import DynamicsName
 from tasks.presets import PresetName, preset_of
 from tasks.run import plans_of, summary_of
-from tasks.sensing import EstimatorName, Sensing
+from tasks.sensing import EstimatorName, Perception, Sensing
 from tasks.sensors import SensorName
 from tasks.session import Planners, Session
+from tasks.strike import strike_step
 from tasks.targets import random_kick, random_roll
 
 # Delays that are no number: drawn from what plans took before, and by the clock, with plans made in a thread.
@@ -187,16 +189,25 @@ def kick_row(
     execution = sessions.session(point.dynamics).execute(
         sessions.planners(point), target, seed, start, sense=sense, world=world, latency=latency
     )
-    timing_of_plans = timing_figures(execution, kick.scene.dt)
     return (
         summary_of(kick, execution, target)
-        | timing_of_plans
+        | timing_figures(execution, kick.scene.dt)
         | {
             "point": point.name,
             "overruns": world.overruns if isinstance(world, PacedWorld) else 0,
             "seed": seed,
+            "estimate": estimate_before_contact(kick, execution, sense),
         }
     )
+
+
+def estimate_before_contact(kick: Kick, execution: Execution, sense: Perception | None) -> EstimateErrors | None:
+    """Return what was known in the last step before the ball was touched; None for perfect sensors, or no contact."""
+    states, controls = np.stack(execution.states), np.stack(execution.controls)
+    contact = strike_step(states, kick.untouched(states[0], len(controls)))
+    if sense is None or contact is None:
+        return None
+    return estimate_errors(kick.scene, sense, states, controls, max(contact - 2, 0))
 
 
 def timing_figures(execution: Execution, dt: float) -> dict[str, Any]:
@@ -234,6 +245,7 @@ def point_figures(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "falls": total("fell"),
         **{name: total(name) for name in ("replans", "deadlines_missed", "overruns")},
         **{name: mean(name) for name in ("replans_per_second", "prediction_error_m", "lead_ms")},
+        "estimate": mean_errors([row["estimate"] for row in rows if row["estimate"] is not None]),
     }
 
 
@@ -337,8 +349,14 @@ def main(
     report.write_picture(json.with_suffix(".png"), picture(figures))
     table = table_of(figures, settings)
     report.show(table)
+    name = f"realtime_{'_'.join(sensors)}" + (f"_rolling_{rolling:g}".replace(".", "_") if rolling else "")
     if publish:
-        report.publish(f"realtime_{'_'.join(sensors)}", f"Real time, {targets} targets", settings.command, table)
+        report.publish(name, f"Real time, {targets} targets", settings.command, table)
+    errors = {point.name: value["estimate"] for point, value in figures.items() if value["estimate"]}
+    if errors:
+        report.show(estimates := errors_table(errors))
+        if publish:
+            report.publish(f"{name}_estimates", "What was known of the state", settings.command, estimates)
 
 
 def jobs_of(settings: RealtimeSettings, points: list[RealtimePoint]) -> dict[str, Callable[[], report.Row]]:
