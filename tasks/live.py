@@ -341,7 +341,7 @@ class Live:
             )
         self.page.panel.figures("\n".join(lines))
         self.page.panel.plot(
-            "Cost of the plan, by term", {n: [i.terms[n] for i in infos] for n in infos[0].terms}, "plan"
+            "Cost of the plan, in thousandths", {n: [1e3 * i.terms[n] for i in infos] for n in infos[0].terms}, "plan"
         )
         if len(self.errors) > 1:
             errors = dict(zip(("in MuJoCo", "expected"), (100.0 * np.array(self.errors)).T.tolist(), strict=True))

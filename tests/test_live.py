@@ -22,6 +22,7 @@ from viewer import LivePage, PageClosedError, Push
 from viewer.camera import VIEWS, PictureCamera, View
 from viewer.handles import Handles
 from viewer.recording import mask_unpredicted
+from viewer.stage import GOAL_CORNERS
 
 SCENE = human_and_ball()
 
@@ -94,6 +95,14 @@ def test_a_paused_page_makes_a_kick_wait_until_a_step_is_requested(page: LivePag
     page.close()
     with pytest.raises(PageClosedError):
         page.hold(0.0)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_every_view_has_the_goal_and_the_target_in_its_picture(view: View, page: LivePage) -> None:
+    stage, aspect = page._stage, 1.2
+    assert stage is not None
+    points = np.concatenate([GOAL_CORNERS, [page.settings.target]])
+    assert (np.abs(stage.camera(view, aspect)(points)) <= (1.0, 1.0 / aspect)).all()
 
 
 def test_a_push_changes_the_velocity_of_its_body_alone(kick: Kick) -> None:

@@ -208,8 +208,8 @@ def test_the_page_is_not_blank_and_has_human_and_target_in_its_picture(
     def is_drawn() -> bool:
         picture = pixels(page)
         red, green, blue = np.moveaxis(picture, -1, 0)
-        green, blue = (green > red + 0.12) & (green > blue + 0.02), blue > red + 0.15
-        return bool((np.ptp(picture, axis=-1) > 0.3).mean() > 0.002 and green.any() and blue.any())
+        magenta, blue = (red > green + 0.3) & (blue > green + 0.12), (blue > red + 0.15) & (blue > green + 0.05)
+        return bool((np.ptp(picture, axis=-1) > 0.3).mean() > 0.002 and magenta.any() and blue.any())
 
     until(is_drawn)
     page.close()

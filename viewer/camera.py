@@ -11,7 +11,7 @@ VIEWS: tuple[View, ...] = get_args(View)
 # Viewing direction of a camera: its bearing, from x to the left, and its downward tilt [rad]. From the side and
 # slightly from behind; along the kick; against it; from above.
 DIRECTIONS: dict[View, tuple[float, float]] = {
-    "side": (1.13, 0.21),
+    "side": (0.85, 0.11),
     "behind": (0.21, 0.24),
     "goal": (2.93, 0.17),
     "above": (1.57, 1.22),

@@ -13,7 +13,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from scipy.spatial import ConvexHull
@@ -25,7 +24,18 @@ from larp_model.scene import Link, Scene
 from larp_model.state import ORIENTATION, POSITION
 from viewer.camera import PictureCamera, around
 from viewer.recording import Approach, Recording, nearest_approach
-from viewer.scene_view import BALL_PATCHES, GROUND_TRUTH, PREDICTION, TARGET, Colour, football_meshes, link_colour
+from viewer.scene_view import (
+    BALL_PATCHES,
+    GROUND_TRUTH,
+    MARKINGS,
+    PITCH,
+    PREDICTION,
+    TARGET,
+    Colour,
+    football_meshes,
+    link_colour,
+    sky,
+)
 
 SUFFIXES = (".mp4", ".gif")
 SLOW_SPEED = 0.25  # playback speed up to the target, as a fraction of real time
@@ -33,7 +43,7 @@ SLOW_AFTER = 0.1  # s after the closest approach during which playback stays slo
 DOTS = 100  # per inch
 NEAR, FAR = 0.5, 20.0  # m, between which the ground is drawn
 LIGHT = np.array([0.25, -0.45, -1.0])  # direction in which light falls
-SKY, GROUND, LINES, SHADOW, INK, QUIET = "#ffffff", "#f3f5f7", "#d5dae0", "#dde1e6", "#22262c", "#5b6470"
+INK, QUIET, SHADOW = "#22262c", "#434b57", 0.7  # the shadow dims the pitch to this share
 CIRCLE = np.stack([np.cos(np.linspace(0, 2 * np.pi, 40)), np.sin(np.linspace(0, 2 * np.pi, 40))], axis=-1)
 
 
@@ -84,7 +94,7 @@ def frames(recording: Recording, size: tuple[int, int] = (1280, 720), rate: floa
     approach = nearest_approach(recording.path, recording.target)
     camera = PictureCamera.of(_points_in_view(recording, approach), size[1] / size[0])
     across = size[1] / size[0]
-    figure = Figure((size[0] / DOTS, size[1] / DOTS), DOTS, facecolor=SKY)
+    figure = Figure((size[0] / DOTS, size[1] / DOTS), DOTS)
     canvas: Any = FigureCanvasAgg(figure)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(-1.0, 1.0), ylim=(-across, across))
     axes.set_axis_off()
@@ -102,7 +112,7 @@ def frames(recording: Recording, size: tuple[int, int] = (1280, 720), rate: floa
 
 def _clear(axes: Axes) -> None:
     """Remove everything drawn but keep the axes, which take longer to create than a frame."""
-    for artist in (*axes.collections, *axes.lines, *axes.patches, *axes.texts):
+    for artist in (*axes.images, *axes.collections, *axes.lines, *axes.patches, *axes.texts):
         artist.remove()
 
 
@@ -122,9 +132,12 @@ def _points_in_view(recording: Recording, approach: Approach) -> np.ndarray:
 
 
 def _draw_ground(axes: Axes, camera: PictureCamera) -> None:
-    """Draw the ground, a metre grid that fades with distance; it never moves and is drawn only once."""
+    """Draw the sky and the ground, a metre grid that fades with distance; it never moves and is drawn only once."""
     horizon = float(camera(camera.position + 1e4 * (camera.axes[2] * (1.0, 1.0, 0.0)))[1])
-    axes.axhspan(-1.0, horizon, color=GROUND, zorder=0)
+    axes.axhspan(-1.0, horizon, color=_rgb(PITCH), zorder=0)
+    limits = axes.get_xlim(), axes.get_ylim()
+    axes.imshow(sky(), extent=(-1.0, 1.0, horizon, max(horizon + 0.01, limits[1][1])), aspect="auto", zorder=0)
+    axes.set(xlim=limits[0], ylim=limits[1])
     middle = np.round(camera.position + 0.5 * FAR * camera.axes[2])
     for along, across in ((0, 1), (1, 0)):
         for shift in np.arange(-FAR, FAR + 1.0):
@@ -134,7 +147,7 @@ def _draw_ground(axes: Axes, camera: PictureCamera) -> None:
             line = line[camera.depth(line) > NEAR]
             if len(line) > 1:
                 fade = np.clip(1.0 - camera.depth(line[1:]) / FAR, 0.0, 1.0)
-                colours = [(*to_rgb(LINES), share) for share in fade]
+                colours = [(*_rgb(MARKINGS), share) for share in fade]
                 segments = np.stack([camera(line[:-1]), camera(line[1:])], axis=1)
                 axes.add_collection(LineCollection(list(segments), colors=colours, lw=0.8, zorder=0.1))
 
@@ -146,7 +159,7 @@ def _draw_scene(axes: Axes, camera: PictureCamera, recording: Recording, approac
     state = recording.states[row]
     _draw_shadows(axes, camera, recording.scene, state)
     goal, size = camera.sphere(target, recording.radius)
-    _draw_disc(axes, goal, size, fc=_rgb(TARGET), alpha=0.35, ec=_rgb(TARGET), lw=1.5, zorder=1)
+    _draw_disc(axes, goal, size, fc=_rgb(TARGET), alpha=0.6, ec=_rgb(TARGET), lw=1.5, zorder=1)
     _draw_paths(axes, camera, recording, row)
     _draw_links(axes, camera, recording.scene, state, ball)
     _draw_ball(axes, camera, state[ball], recording.radius)
@@ -173,7 +186,11 @@ def _draw_shadows(axes: Axes, camera: PictureCamera, scene: Scene, state: np.nda
     outlines = [
         _shadow(camera, _capsule_ends(link, row), link.radius) for link, row in zip(scene.links, state, strict=True)
     ]
-    axes.add_collection(PolyCollection(outlines, facecolors=SHADOW, edgecolors="none", zorder=0.2))
+    axes.add_collection(
+        PolyCollection(
+            outlines, facecolors=[tuple(SHADOW * part for part in _rgb(PITCH))], edgecolors="none", zorder=0.2
+        )
+    )
 
 
 def _draw_paths(axes: Axes, camera: PictureCamera, recording: Recording, row: int) -> None:
@@ -231,8 +248,9 @@ def _draw_captions(axes: Axes, title: str, clock: str) -> None:
     axes.text(0.025, 0.95, title, fontsize=17, weight="bold", **style)
     axes.text(0.025, 0.885, clock, fontsize=12, color=QUIET, **style)
     legend = (("truth (MuJoCo)", GROUND_TRUTH), ("prediction", PREDICTION), ("target", TARGET))
+    behind = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8}
     for line, (label, colour) in enumerate(legend):
-        axes.text(0.975, 0.95 - 0.045 * line, label, fontsize=12, ha="right", color=_rgb(colour), **style)
+        axes.text(0.975, 0.95 - 0.05 * line, label, fontsize=12, ha="right", color=_rgb(colour), bbox=behind, **style)
 
 
 def _draw_ball(axes: Axes, camera: PictureCamera, state: np.ndarray, radius: float) -> None:

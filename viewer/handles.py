@@ -15,7 +15,8 @@ SIZE = 0.45  # m, of a handle's arrows
 ARROW_TIME = 0.3  # s: an arrow ends where the ball would be after this time
 # Offset [m] of the handle of the rolling velocity from the end of the arrow, clear of the handle of the spot.
 ROLL_HANDLE_OFFSET = np.array([0.0, 0.0, 0.35])
-ROLLING, FAINT = (204, 121, 167), (140, 190, 170)
+ROLLING, RING, REACH = (240, 228, 66), (255, 255, 255), (166, 196, 154)
+RING_RADIUS, PIN_RADIUS = 0.2, 0.05  # m
 
 
 class Handles:
@@ -38,9 +39,10 @@ class Handles:
         self.spot: tuple[float, ...] = (0.0, 0.0)
         self.roll: tuple[float, ...] = (0.0, 0.0)
         flat_style: dict[str, Any] = {"disable_rotations": True, "active_axes": (True, True, False)}
-        self._target = self._handle("target", {"disable_rotations": True}, SIZE)
-        self._spot = self._handle("spot", flat_style, 0.7 * SIZE)
+        self._target = self._handle("target", {"disable_rotations": True, "disable_sliders": True}, SIZE)
+        self._spot = self._handle("spot", {"disable_sliders": True, **flat_style}, 0.7 * SIZE)
         self._roll = self._handle("roll", flat_style, 0.5 * SIZE)
+        self._draw_marks()
         self._draw_reach()
         self._place_handles()
 
@@ -92,13 +94,29 @@ class Handles:
             points = np.array([[begin, end]], np.float32)
             self._server.scene.add_arrows("/handles/rolling", points, ROLLING)
 
+    def _draw_marks(self) -> None:
+        """Draw what moves with the handles of the ball: a ring around its spot and, for its roll, the head of a pin."""
+        scene = self._server.scene
+        angles = np.linspace(0.0, 2.0 * np.pi, 49)
+        below = np.full_like(angles, 0.01 - self._ball[2])
+        circle = np.stack([RING_RADIUS * np.cos(angles), RING_RADIUS * np.sin(angles), below], axis=1)
+        segments = np.stack([circle[:-1], circle[1:]], axis=1).astype(np.float32)
+        scene.add_line_segments("/handles/spot/ring", segments, RING, thickness=0.025)
+        scene.add_label("/handles/spot/label", "ball", position=(0.0, -0.5, below[0]), font_screen_scale=0.8)
+        scene.add_icosphere("/handles/roll/head", PIN_RADIUS, ROLLING, cast_shadow=False)
+        needle = np.array([[(0.0, 0.0, 0.0), -ROLL_HANDLE_OFFSET]], np.float32)
+        scene.add_line_segments("/handles/roll/needle", needle, ROLLING, thickness=0.02)
+        scene.add_label(
+            "/handles/roll/label", "roll", anchor="bottom-center", position=(0.0, 0.0, 0.08), font_screen_scale=0.8
+        )
+
     def _draw_reach(self) -> None:
         """Draw on the ground the outline of the box that is offered for the target."""
         (low_x, low_y, _), (high_x, high_y, _) = self._offer.target
         corners = np.array([(low_x, low_y), (high_x, low_y), (high_x, high_y), (low_x, high_y)])
         ring = np.concatenate([corners, np.full((4, 1), 0.01)], axis=1)
         segments = np.stack([ring, np.roll(ring, -1, axis=0)], axis=1).astype(np.float32)
-        self._server.scene.add_line_segments("/handles/reach", segments, FAINT, thickness=0.008)
+        self._server.scene.add_line_segments("/handles/reach", segments, REACH, thickness=0.015)
 
     @property
     def ball_position(self) -> np.ndarray:

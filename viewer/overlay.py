@@ -22,7 +22,7 @@ from viewer.server import close_server, open_server
 from viewer.stage import ground
 
 KEYPOINT = (204, 51, 17)
-LEGEND = "in colour: executed, grey: kinematic start, red: keypoints, and how far off they are"
+LEGEND = "in colour: executed, white: kinematic start, red: keypoints, and how far off they are"
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ def overlay_page(overlay: Overlay) -> str:
         with server.atomic():
             ground(server)
             human = SceneView(server, scene, "/human")
-            start = SceneView(server, scene, "/start", REFERENCE, opacity=0.25)
+            start = SceneView(server, scene, "/start", REFERENCE, opacity=0.4)
             first_pairs = overlay.at(0)
             points = server.scene.add_point_cloud(
                 "/keypoints", first_pairs[:, 0], KEYPOINT, point_size=0.02, point_shape="circle", precision="float32"

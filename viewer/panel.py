@@ -24,12 +24,13 @@ FILES = ("html", "png", "gif")
 # Upper bound of a cost's weight, as a multiple of its initial one.
 HEAVIEST = 5.0
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#333333")
-LEAST = 1e-6  # lower bound of costs on a logarithmic axis
-ABOUT = """Drag the green target, then **Kick** (key K). The model plans, MuJoCo carries out.
+LEAST = 1e-3  # lower bound of values on a logarithmic axis, whose labels have three decimals
+WHOLE_STEPS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # between the labels of a horizontal axis
+ABOUT = """Drag the magenta target, then **Kick** (key K). The model plans, MuJoCo carries out.
 
-The ball has two handles: where it lies and, above it, how it rolls.
+The ball has two handles: the white ring, where it lies, and the yellow pin, how it rolls.
 
-Thin lines are other candidates, dark ones cheap; grey is the reference."""
+Thin lines are other candidates, bright ones cheap."""
 
 OnRequest = Callable[[str, "viser.ClientHandle | None"], None]
 
@@ -251,12 +252,15 @@ class Panel:
         columns += [
             uplot.Series(label=label, stroke=PALETTE[row % len(PALETTE)], width=2) for row, label in enumerate(series)
         ]
+        no_ticks: uplot.Axis_Ticks = {"show": False}
         with self._folder:
             self._plots[name] = self._gui.add_uplot(
                 data,
                 tuple(columns),
                 title=name,
                 scales={"x": uplot.Scale(time=False), "y": uplot.Scale(distr=3)},
+                axes=(uplot.Axis(incrs=WHOLE_STEPS, ticks=no_ticks), uplot.Axis(ticks=no_ticks)),
+                padding=(14, 12, 0, 0),
                 height=220,
             )
 

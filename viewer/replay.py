@@ -15,7 +15,9 @@ from viewer.stage import LEGEND, Stage, points_in_view
 
 FRAME = 0.02  # s of recorded time between two frames
 
-_CAPTION = """<div style="position:fixed;z-index:1;right:1em;top:1em;max-width:28em;padding:.6em .9em;
+# The style undoes a fade of the picture, which ends after a few frames: late, in a slow browser.
+_CAPTION = """<style>canvas{{opacity:1!important}}</style>
+<div style="position:fixed;z-index:1;right:1em;top:1em;max-width:28em;padding:.6em .9em;
 font:14px/1.5 system-ui,sans-serif;color:#222;background:#fffc;pointer-events:none">{}</div>"""
 
 
@@ -56,6 +58,8 @@ def animation_html(server: viser.ViserServer, rows: int, dt: float, show: Callab
 
     n is such that frames are about `FRAME` apart.
     """
+    # Without any map, Viser's player shows its own one at first, anew in each round.
+    server.scene.configure_environment_map("studio", environment_intensity=0.0)
     serializer, stride = server.get_scene_serializer(), max(1, round(FRAME / dt))
     for row in range(0, rows, stride):
         show(row)

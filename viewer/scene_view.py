@@ -18,15 +18,28 @@ from larp_model.state import ORIENTATION, POSITION, SIZE
 Colour = tuple[int, int, int]
 Mesh = tuple[np.ndarray, np.ndarray]  # vertices (V, 3) [m], faces (F, 3)
 
-TRUNK, LEFT, RIGHT = (92, 107, 133), (112, 178, 217), (233, 160, 60)
+TRUNK, LEFT, RIGHT = (38, 52, 110), (0, 104, 204), (236, 92, 0)
 BALL_PATCHES = ((246, 246, 243), (38, 40, 46))  # hexagons, pentagons
-# Okabe and Ito's, safe for all eyes.
-GROUND_TRUTH, PREDICTION, TARGET, REFERENCE = (213, 94, 0), (0, 114, 178), (0, 158, 115), (110, 116, 126)
+# Distinct for all eyes, on the pitch and on white: after Okabe and Ito, but for a target that no lawn hides.
+GROUND_TRUTH, PREDICTION, REFERENCE, TARGET = (213, 94, 0), (0, 114, 178), (250, 250, 250), (204, 20, 122)
+PITCH, GRID, MARKINGS = (126, 163, 112), (147, 183, 133), (238, 244, 234)
+# Radius of what is translucent, as a share of its own: it shows where it differs from what is not, and hides nothing.
+GHOST_RADIUS = 0.96
+ZENITH, HORIZON = (118, 166, 214), (230, 239, 246)  # of the sky
 
 
 def link_colour(link: Link) -> Colour:
     """Return the colour of a link, by the side of the body that its name begins with."""
     return LEFT if link.name.startswith("left") else RIGHT if link.name.startswith("right") else TRUNK
+
+
+def sky(share: float = 1.0, rows: int = 256) -> np.ndarray:
+    """Return a picture (rows, 1, 3) of the sky, with values from 0 to 255.
+
+    share: of its height in which it fades to the colour of the horizon, from above.
+    """
+    fade = np.clip(np.arange(rows) / (share * rows), 0.0, 1.0)[:, None, None]
+    return np.asarray((1.0 - fade) * ZENITH + fade * HORIZON, np.uint8)
 
 
 def weld(triangles: np.ndarray) -> Mesh:
@@ -103,7 +116,7 @@ class Capsules:
 
         name: in Viser's tree. colours: of each link. opacity: in (0, 1), or None.
         """
-        radii = np.array([link.radius for link in links])
+        radii = np.array([link.radius for link in links]) * (1.0 if opacity is None else GHOST_RADIUS)
         self._to_end = np.array([0.5 * link.length * np.array(link.axis) for link in links])
         self._along = Rotation.concatenate([Rotation.align_vectors(link.axis, (0.0, 0.0, 1.0))[0] for link in links])
         self._sizes = np.stack([radii, radii, [link.length for link in links]], axis=-1)
@@ -161,7 +174,7 @@ class SceneView:
         self._balls = {}
         for body in scene.bodies:
             if body.is_ball:
-                node, radius = f"{name}/{body.name}", body.links[0].radius
+                node, radius = f"{name}/{body.name}", body.links[0].radius * (1.0 if opacity is None else GHOST_RADIUS)
                 self._balls[scene.rows(body.name).start] = server.scene.add_frame(node, show_axes=False)
                 vertices, faces = unit_meshes()[0]
                 meshes = ((radius * vertices, faces),) if colour else football_meshes(radius)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import viser
 from matplotlib import colormaps
@@ -10,15 +12,30 @@ from larp_model.scene import Scene
 from larp_model.state import POSITION
 from viewer.camera import PictureCamera, View, around
 from viewer.recording import Recording, nearest_approach
-from viewer.scene_view import GROUND_TRUTH, PREDICTION, REFERENCE, TARGET, Colour, SceneView
+from viewer.scene_view import (
+    GRID,
+    GROUND_TRUTH,
+    MARKINGS,
+    PITCH,
+    PREDICTION,
+    REFERENCE,
+    TARGET,
+    Colour,
+    SceneView,
+    sky,
+)
 
-LEGEND = "orange: truth, blue: prediction, green: target"
-GROUND, LINES, POSTS = (233, 238, 234), (190, 202, 194), (250, 250, 250)
+LEGEND = "orange: truth, blue: prediction, white: reference, magenta: target"
+POSTS, NET = (255, 255, 255), (222, 230, 226)
 GOAL = (6.0, 3.0, 2.0)  # m: how far ahead it stands, how wide and how high it is; for scale alone
+GOAL_AREA = (1.5, 5.0)  # m: how far it reaches from the goal, how wide it is
+GOAL_LINE, LINE_WIDTH = 20.0, 0.05  # m: its length; the width of all markings
 FIELD_OF_VIEW = 0.7  # rad, from top to bottom
-FAR = 6  # m, up to which the ground has distance labels
+FAR = 5  # m, up to which the ground has distance labels
+GOAL_CORNERS = np.array([(GOAL[0], y * GOAL[1], z * GOAL[2]) for y in (-0.5, 0.5) for z in (0.0, 1.0)])
+SKY_SHARE = 0.35  # of the picture, in which the sky fades towards the horizon
 # Colour map of candidates' paths, and the parts of it for the cheapest and the most expensive one.
-FAN, CHEAP, DEAR = "viridis_r", 0.05, 0.95
+FAN, CHEAP, DEAR = "plasma", 0.97, 0.05
 
 
 class Lane:
@@ -35,13 +52,13 @@ class Lane:
         self._radius = scene.links[traced].radius
         self._root = server.scene.add_frame(name, show_axes=False, position=(0.0, offset_y, 0.0))
         self._ball = server.scene.add_icosphere(
-            f"{name}/target", self._radius, TARGET, opacity=0.45, cast_shadow=False, receive_shadow=False
+            f"{name}/target", self._radius, TARGET, opacity=0.7, cast_shadow=False, receive_shadow=False
         )
-        self._label = server.scene.add_label(f"{name}/nearest", "", anchor="bottom-center", visible=False)
+        self._label = server.scene.add_label(f"{name}/nearest", "target", anchor="bottom-center")
         self._ground_truth = SceneView(server, scene, f"{name}/truth")
         self._ghosts = {
             "prediction": SceneView(server, scene, f"{name}/prediction", PREDICTION, opacity=0.35),
-            "reference": SceneView(server, scene, f"{name}/reference", REFERENCE, opacity=0.18),
+            "reference": SceneView(server, scene, f"{name}/reference", REFERENCE, opacity=0.4),
         }
         for ghost in self._ghosts.values():
             ghost.update(None)
@@ -82,13 +99,13 @@ class Lane:
             }
             approaches = {kind: nearest_approach(kind_path, self.target) for kind, kind_path in paths.items()}
             if not approaches:
-                self._label.visible = False
+                self._label.text = "target"
                 return float("inf")
             if len(approaches) > 1 and np.linalg.norm(approaches[""].point - paths[""][-1]) < self._radius:
                 del approaches[""]  # the true path still approaches the target
             kind, approach = next(iter(approaches.items()))
             self._line("miss", np.stack([approach.point, self.target]), TARGET, 0.012)
-            self._label.text, self._label.visible = f"{100.0 * approach.distance:.1f} cm{kind}", True
+            self._label.text = f"target: {100.0 * approach.distance:.1f} cm{kind}"
         return approach.distance
 
     def fan(self, paths: np.ndarray | None, costs: np.ndarray | None = None) -> None:
@@ -104,7 +121,7 @@ class Lane:
         segment_colours = np.broadcast_to(colours[:, None, None], (len(paths), paths.shape[1] - 1, 2, 3)).reshape(
             -1, 2, 3
         )
-        self._server.scene.add_line_segments(node, segments.astype(np.float32), segment_colours, thickness=0.006)
+        self._server.scene.add_line_segments(node, segments.astype(np.float32), segment_colours, thickness=0.01)
 
     def position(self, state: np.ndarray) -> np.ndarray:
         """Return positions (*, 3) [m] of the traced link in states (*, L, 13)."""
@@ -155,7 +172,7 @@ class Stage:
 
     def frame(self, points: np.ndarray) -> None:
         """Set the points (P, 3) [m] that cameras must see, and the camera of newly opened pages and of a reset view."""
-        self._visible_points = around(points)
+        self._visible_points = around(points, GOAL_CORNERS)
         camera = self.camera("side", 1.6)
         initial = self._server.initial_camera
         initial.fov, initial.position, initial.look_at = FIELD_OF_VIEW, camera.position, self.look_at_point(camera)
@@ -181,28 +198,37 @@ def points_in_view(recording: Recording) -> np.ndarray:
 
 
 def ground(server: viser.ViserServer) -> None:
-    """Add the ground with a metre grid, the upward direction and the light."""
+    """Add the ground with a metre grid, the sky, the upward direction and the light."""
     server.scene.set_up_direction("+z")
-    server.scene.configure_environment_map("studio", environment_intensity=0.6)
+    # Without Viser's environment map: it fades in over several frames, and a slow browser shows a pale scene meanwhile.
+    server.scene.configure_environment_map(None)
+    server.scene.add_light_hemisphere("/sky", ground_color=(225, 222, 205), intensity=1.6)
+    server.scene.set_background_image(np.repeat(sky(SKY_SHARE), 2, axis=1), "png")
     server.scene.add_grid(
         "/ground",
-        60.0,
-        60.0,
+        120.0,
+        120.0,
         cell_size=1.0,
         section_size=5.0,
-        section_thickness=1.5,
-        cell_color=LINES,
-        section_color=LINES,
-        plane_color=GROUND,
+        section_thickness=1.0,
+        cell_color=GRID,
+        section_color=GRID,
+        plane_color=PITCH,
         plane_opacity=1.0,
-        shadow_opacity=0.3,
-        fade_distance=30.0,
+        shadow_opacity=0.45,
+        fade_distance=60.0,
     )
 
 
 def _pitch(server: viser.ViserServer) -> None:
-    """Add the ground with a metre grid and distance labels, and a goal."""
+    """Add the ground with a metre grid, markings and distance labels, and a goal."""
     ground(server)
+    _goal(server)
+    ahead, (reach, width) = GOAL[0], GOAL_AREA
+    corners = [(ahead, -0.5 * width), (ahead - reach, -0.5 * width), (ahead - reach, 0.5 * width), (ahead, 0.5 * width)]
+    ends = [((ahead, -0.5 * GOAL_LINE), (ahead, 0.5 * GOAL_LINE)), *pairwise(corners)]
+    lines = np.pad(np.array(ends, np.float32), ((0, 0), (0, 0), (0, 1)), constant_values=0.005)
+    server.scene.add_line_segments("/ground/markings", lines, MARKINGS, thickness=LINE_WIDTH)
     for metre in range(1, FAR + 1):
         server.scene.add_label(
             f"/ground/{metre}",
@@ -210,6 +236,10 @@ def _pitch(server: viser.ViserServer) -> None:
             position=(float(metre), -2.0, 0.0),
             font_screen_scale=0.7,
         )
+
+
+def _goal(server: viser.ViserServer) -> None:
+    """Add the goal: posts, a bar and a net."""
     ahead, width, height = GOAL
     for name, size, position in (
         ("left", (0.08, 0.08, height), (ahead, 0.5 * width, 0.5 * height)),
@@ -221,4 +251,4 @@ def _pitch(server: viser.ViserServer) -> None:
     slope = [(ahead + 0.8 * share, height * (1.0 - share)) for share in np.linspace(0.0, 1.0, 9)]
     net = [((ahead, y, height), (ahead + 0.8, y, 0.0)) for y in across]
     net += [((x, across[0], z), (x, across[-1], z)) for x, z in slope]
-    server.scene.add_line_segments("/goal/net", np.array(net, np.float32), LINES, thickness=0.01)
+    server.scene.add_line_segments("/goal/net", np.array(net, np.float32), NET, thickness=0.01)
