@@ -209,7 +209,8 @@ def serve(
     session: Session, goal: np.ndarray, human: HumanOptions, plans: PlanOptions, outputs: Outputs, address: PageAddress
 ) -> None:
     """Show the page, on which the user chooses and kicks, until Ctrl-C; the first kick begins at once."""
-    from tasks.live import Choices, Live, weights_for
+    from tasks.live import Live
+    from tasks.live_choices import Choices, weights_for
     from viewer import LivePage
 
     reference = human.reference

@@ -6,12 +6,14 @@ Planning never waits for the browser: the page draws in a thread of its own, and
 from __future__ import annotations
 
 import json
+import math
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import get_args
 
 import jax
 import numpy as np
@@ -21,15 +23,17 @@ from larp_model.engines.mujoco import Truth
 from larp_model.errors import InputError
 from larp_model.scene import Scene
 from mpc import Window
-from mpc.loop import DivergenceError, Execution, PlanRecord
-from tasks.models import NO_WEIGHTS, DynamicsName
-from tasks.presets import Preset
+from mpc.loop import DivergenceError, Execution
+from mpc.realtime import SimulatedLatency
+from tasks.live_choices import REAL_TIME, Choices, latency_of
+from tasks.live_figures import show_figures
 from tasks.run import REACHABLE, Run, facts, plans_of
+from tasks.sensing import Perception, Sensing
+from tasks.sensors import PERFECT, SENSORS, SensorName
 from tasks.session import Planners, Session
 from tasks.task import Task
 from viewer import (
     LivePage,
-    Offer,
     PageClosedError,
     Push,
     Recording,
@@ -39,36 +43,16 @@ from viewer import (
     write_film,
 )
 
-# Ranges of the settings: targets [m], the ball's spot from its usual one [m], its velocity [m/s].
-TARGETS = ((1.5, -2.5, 0.11), (6.0, 2.5, 1.5))
-SPOTS = ((-0.06, -0.06), (0.06, 0.06))
-ROLLS = ((-2.0, -2.0), (1.0, 2.0))
+# A rehearsal ends so many steps after the reference's strike, when balance is recovered; its plans take so long [s].
+REHEARSED, REHEARSED_DELAY = 30, 0.05
+# Plans that the next kick's are expected to take as long as, in the median.
+TIMED_PLANS = 50
 # The page warns beyond this novelty, which held-out random episodes do not reach; that of usual plans is about 1. See
 # `evaluation.novelty`.
 NOVEL = 4.0
 # Kicks whose errors are shown.
 ERRORS_SHOWN = 30
 FILM = (960, 540)
-
-
-class Choices(NamedTuple):
-    """Options of the page, by name, the default first. tasks: one for each reference, created when needed."""
-
-    tasks: Mapping[str, Callable[[], Task]]
-    presets: Mapping[str, Preset]
-    dynamics: tuple[DynamicsName, ...]
-    weights: Mapping[str, Path | None]
-
-    def offer(self, task: Task) -> Offer:
-        """Return the options that the page shows, with a task's cost terms and the ranges of the settings."""
-        terms = tuple((term.name, term.weight) for term in task.terms)
-        names = tuple(self.presets), self.dynamics, tuple(self.weights), tuple(self.tasks)
-        return Offer(*names, terms, TARGETS, SPOTS, ROLLS)
-
-
-def weights_for(chosen: Path | None) -> dict[str, Path | None]:
-    """Return the weights that can be chosen, by name: the chosen ones, if any, and none."""
-    return ({} if chosen is None else {chosen.stem: chosen}) | {NO_WEIGHTS: None}
 
 
 class PushableWorld:
@@ -114,11 +98,15 @@ class Live:
         self._tasks: dict[str, Task] = {}
         self._sessions: dict[tuple[str, str, str], Session] = {}
         self._planners: dict[tuple[str, str, str, str, float], Planners] = {}
+        self._sensing: dict[tuple[str, str], Sensing] = {}
+        self._plan_seconds: dict[tuple[object, ...], deque[float]] = {}
         self.errors: deque[tuple[float, float]] = deque(maxlen=ERRORS_SHOWN)
         self.run: Run | None = None
         self.recording: Recording | None = None
         self.planned_for: Settings | None = None
         self.plans = 0
+        # Of the last kick: whether it does not wait for plans, and how many steps took longer than they last.
+        self._keeps_time, self._slow_steps = False, 0
         self.saved: dict[str, Path] = {}
         task = self.task(next(iter(choices.tasks)))
         page.files = self.file
@@ -198,26 +186,35 @@ class Live:
         settings = self.page.settings
         if (task := self._prepare(settings)) is None:
             return
-        world, records = PushableWorld(task.scene, task.substeps), list[PlanRecord]()
-        targets = [settings.target]
+        world, targets = PushableWorld(task.scene, task.substeps), [settings.target]
 
         def window(step: int) -> Window:
             targets.append(self.page.settings.target)
             return self._window(task)(step)
 
         try:
+            seconds, sense = self._rehearsed(task, settings, world), self._sense(task, settings)
+            planners = self.planners(settings)
+            horizon = min(planners.replan.horizon, planners.recovery.horizon)
+            latency = latency_of(settings.delay, task.scene.dt, seconds, self.page.speed, horizon)
+            self._keeps_time = latency is not None
             execution = self.session(settings).execute(
-                self.planners(settings),
+                planners,
                 settings.target,
                 self.seed,
                 initial_state(task, settings),
-                observe=self._observer(task, settings, world, records),
+                observe=self._observer(task, settings, world, sense),
+                sense=sense,
                 world=world,
                 window=window,
+                latency=latency,
             )
-            labels = {name: getattr(settings, name) for name in ("preset", "dynamics", "weights")}
+            seconds.extend(plan.seconds for plan in execution.plans[1:])
+            labels = {name: getattr(settings, name) for name in ("preset", "dynamics", "weights", "sensors", "delay")}
             self.run = Run.of(task, execution, task.check(targets[-1]), **labels, seed=self.seed)
             self.recording = self.run.recording
+            if sense is not None:
+                self.recording = replace(self.recording, estimated=states_of(sense))
         except InterruptedKickError as interruption:
             if str(interruption) == "kick":
                 self.page.request("kick")
@@ -228,31 +225,71 @@ class Live:
             self.page.show_message(f"**Ended:** {error}")
             return
         self.errors.append((self.run.truth_error_m, self.run.model_error_m))
-        self._show_figures(records, settings, task.scene.dt)
+        self._show_figures(execution, settings, task.scene.dt)
         self.page.finish(self.recording)
         if len(self.errors) == 1:
             self._try_to_save(self._finished, self.run)
 
-    def _observer(
-        self, task: Task, settings: Settings, world: PushableWorld, records: list[PlanRecord]
-    ) -> Callable[[Execution], None]:
-        """Return a function that shows every step on the page at the page's speed, and appends new plans to `records`.
+    def _sense(self, task: Task, settings: Settings) -> Perception | None:
+        """Return what the chosen sensors make of the states of a kick; None where they are perfect."""
+        key = settings.reference, settings.sensors
+        if key not in self._sensing:
+            name: SensorName = next(name for name in get_args(SensorName) if name == settings.sensors)
+            self._sensing[key] = Sensing(task.scene, name)
+        return self._sensing[key].perception(initial_state(task, settings), np.random.default_rng(self.seed))
 
-        It raises InterruptedKickError where a client requests another kick, or none.
+    def _rehearsed(self, task: Task, settings: Settings, world: PushableWorld) -> deque[float]:
+        """Return the times [s] that recent plans with such settings took.
+
+        The first time, where the clock or sensors need it, these are of a kick that nobody sees: it compiles what is
+        called while the clock runs.
+        """
+        key = (*self._planner_key(settings), settings.sensors)
+        clocked = settings.delay == REAL_TIME or SENSORS[settings.sensors] != PERFECT
+        if key not in self._plan_seconds and clocked:
+            self.page.show_message("**Rehearsing**: what is new is compiled before the clock runs, for some seconds.")
+            rehearsal = self.session(settings).execute(
+                self.planners(settings),
+                settings.target,
+                self.seed,
+                initial_state(task, settings),
+                steps=task.reference.strike + REHEARSED,
+                observe=lambda _: self._handle_requests(task, world),
+                sense=self._sense(task, settings),
+                window=self._window(task),
+                latency=SimulatedLatency(task.scene.dt, REHEARSED_DELAY),
+            )
+            plans = rehearsal.plans[1:] or rehearsal.plans
+            self._plan_seconds[key] = deque((plan.seconds for plan in plans), maxlen=TIMED_PLANS)
+        return self._plan_seconds.get(key, deque())
+
+    def _observer(
+        self, task: Task, settings: Settings, world: PushableWorld, sense: Perception | None
+    ) -> Callable[[Execution], None]:
+        """Return a function that shows every step on the page at the page's speed.
+
+        Estimates are known a step later than states, which are then shown a step later. It raises InterruptedKickError
+        where a client requests another kick, or none.
         """
         dt, reference, due_time = task.scene.dt, task.reference.states, time.monotonic()
+        step_begin, self._slow_steps = math.inf, 0
 
         def observe(execution: Execution) -> None:
-            nonlocal due_time
-            step = len(execution.states) - 1
-            last = plans_of(execution)[-1]
-            predicted = last.info.states if last.step == step - 1 else None
-            self.page.update(execution.states[-1], predicted, step * dt, reference[min(step, len(reference) - 1)])
-            if predicted is not None:
-                records.append(last)
-                self._show_figures(records, settings, dt)
-            due_time = due(due_time, dt / self.page.speed)
+            nonlocal due_time, step_begin
+            last, estimate = plans_of(execution)[-1], None if sense is None else sense.estimates[-1].state
+            is_new = last.received == len(execution.states) - 2
+            step = len(execution.states) - (1 if estimate is None else 2)
+            predicted = np.concatenate([last.state[None], last.info.states])[step - last.step :] if is_new else None
+            self.page.update(
+                execution.states[step], predicted, step * dt, reference[min(step, len(reference) - 1)], estimate
+            )
+            if is_new:
+                self._show_figures(execution, settings, dt)
+            duration = dt / self.page.speed
+            self._slow_steps += time.monotonic() - step_begin > duration
+            due_time = due(due_time, duration)
             self.page.hold(due_time)
+            step_begin = time.monotonic()
             self._handle_requests(task, world)
 
         return observe
@@ -320,32 +357,13 @@ class Live:
             return False
         return True
 
-    def _show_figures(self, plans: list[PlanRecord], settings: Settings, dt: float) -> None:
-        """Show figures of the running kick, and of those before, on the page."""
-        if not plans:
-            return
-        infos, interval = [plan.info for plan in plans], self.planners(settings).interval
-        replan_ms = 1e3 * np.array([info.seconds for info in infos][1:] or [infos[0].seconds])
-        feedbacks = [plan.feedback.seconds for plan in plans if plan.feedback is not None]
-        failed = sum(info.candidates - info.finite for info in infos)
-        lines = [
-            f"- plans: first {infos[0].seconds:.2f} s; again {np.quantile(replan_ms, 0.5):.0f} ms (p50), "
-            f"{np.quantile(replan_ms, 0.99):.0f} ms (p99), every {1e3 * dt * interval:.0f} ms",
-            *(f"- feedback: {seconds:.2f} s, once" for seconds in feedbacks[:1]),
-            f"- candidates lost: {failed} of {sum(info.candidates for info in infos)}",
-        ]
-        if self.errors:
-            actual, expected = 100.0 * np.array(self.errors).T
-            lines.append(
-                f"- missed by {actual.mean():.1f} cm on average of {len(actual)}, the model said {expected.mean():.1f}"
-            )
-        self.page.panel.figures("\n".join(lines))
-        self.page.panel.plot(
-            "Cost of the plan, in thousandths", {n: [1e3 * i.terms[n] for i in infos] for n in infos[0].terms}, "plan"
-        )
-        if len(self.errors) > 1:
-            errors = dict(zip(("in MuJoCo", "expected"), (100.0 * np.array(self.errors)).T.tolist(), strict=True))
-            self.page.panel.plot("Missed by [cm]", errors, "kick")
+    def _show_figures(self, execution: Execution, settings: Settings, dt: float) -> None:
+        """Show figures of a kick, and of those before, on the page."""
+        notes = []
+        if settings.delay == REAL_TIME:
+            slow = f"slow: {self._slow_steps} of {len(execution.controls)} steps took longer than they last"
+            notes.append(slow if self._keeps_time else "plans take too long for real time: the world waits")
+        show_figures(self.page.panel, execution, self.errors, dt, self.planners(settings).interval, notes)
 
     def _handle_replay(self, request: str) -> None:
         """Save the last kick, open a saved one, or show it beside the one being played; `alone` hides it again."""
@@ -376,6 +394,11 @@ class Live:
 def initial_state(task: Task, settings: Settings) -> np.ndarray:
     """Return the state (L, 13) in which a kick begins, with the ball's place and velocity set on the page."""
     return task.start(np.array(settings.spot), np.array(settings.roll))
+
+
+def states_of(sense: Perception) -> np.ndarray:
+    """Return the states (T, L, 13) that were estimated."""
+    return np.stack([estimate.state for estimate in sense.estimates])
 
 
 def due(last: float, step: float) -> float:

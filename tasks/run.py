@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -76,6 +77,23 @@ def summary_of(task: Task, execution: Execution, goal: Any) -> dict[str, Any]:
         ),
         "candidates_lost": sum(plan.info.candidates - plan.info.finite for plan in execution.plans),
         "truth_rollouts": sum(plan.info.verified for plan in plans),
+    }
+
+
+def timing_figures(execution: Execution, dt: float) -> dict[str, Any]:
+    """Return what the replans of an execution in steps of dt [s] made of the time.
+
+    replans: of the whole execution, and of them those missed their deadline: received after the step for which they
+    were made. replans_per_second, prediction_error_m (mean) and lead_ms (mean): of the task itself, without recovery.
+    """
+    replans, own = execution.plans[1:], plans_of(execution)[1:]
+    errors = [plan.error for plan in own if math.isfinite(plan.error)]
+    return {
+        "replans": len(replans),
+        "deadlines_missed": sum(plan.received > plan.step for plan in replans),
+        "replans_per_second": len(own) / (dt * own[-1].received) if own and own[-1].received else 0.0,
+        "prediction_error_m": float(np.mean(errors)) if errors else math.nan,
+        "lead_ms": float(1e3 * dt * np.mean([plan.step - plan.requested for plan in own])) if own else 0.0,
     }
 
 

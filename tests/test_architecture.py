@@ -120,6 +120,8 @@ ORDER = [
     "tasks.task",
     "tasks.run",
     "tasks.session",
+    "tasks.live_choices",
+    "tasks.live_figures",
     "tasks.live",
     "tasks.kick",
     "tasks.episodes.people",

@@ -6,6 +6,7 @@ import json
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,8 +16,23 @@ from hypothesis import strategies as st
 from larp_model import state as packed
 from larp_model.bodies import human_and_ball
 from larp_model.errors import InputError
+from mpc import PlanInfo
+from mpc.loop import Execution, PlanRecord
+from mpc.realtime import MARGIN
 from tasks.kick import Kick
-from tasks.live import ROLLS, SPOTS, TARGETS, Choices, PushableWorld, initial_state, load_recording, weights_for
+from tasks.live import PushableWorld, initial_state, load_recording
+from tasks.live_choices import (
+    DELAYS,
+    REAL_TIME,
+    ROLLS,
+    SPOTS,
+    TARGETS,
+    WORLD_WAITS,
+    Choices,
+    latency_of,
+    weights_for,
+)
+from tasks.live_figures import plan_lines
 from tasks.presets import PRESETS
 from viewer import LivePage, PageClosedError, Push
 from viewer.camera import VIEWS, PictureCamera, View
@@ -44,6 +60,7 @@ def test_the_first_settings_are_the_defaults(page: LivePage, kick: Kick) -> None
     settings = page.settings
     assert settings.target == (4.0, 0.0, 0.5) and settings.spot == settings.roll == (0.0, 0.0)
     assert (settings.preset, settings.dynamics, settings.weights) == (next(iter(PRESETS)), "larp", "none")
+    assert (settings.sensors, settings.delay) == ("perfect", REAL_TIME)
     assert dict(settings.terms) == {term.name: term.weight for term in kick.terms}
     np.testing.assert_array_equal(initial_state(kick, settings), kick.start())
 
@@ -66,6 +83,44 @@ def test_whatever_is_dragged_stays_within_what_is_offered(
 def test_whatever_a_client_sends_weights_stay_within_what_is_offered(value: object, page: LivePage) -> None:
     page.panel._terms["effort"]._impl.value = value
     assert 0.0 <= page.settings.terms["effort"] <= 5.0 * 0.5
+
+
+@pytest.mark.parametrize("name", ["preset", "dynamics", "weights", "reference", "sensors", "delay"])
+@pytest.mark.parametrize("value", ["never heard of", 3, None])
+def test_a_choice_that_is_not_offered_is_the_default(name: str, value: object, page: LivePage) -> None:
+    default = getattr(page.settings, name)
+    page.panel._controls[name]._impl.value = value
+    assert getattr(page.settings, name) == default
+
+
+@pytest.mark.parametrize("delay", DELAYS)
+@pytest.mark.parametrize("speed", [0.5, 1.0])
+def test_plans_are_expected_after_their_delay(delay: str, speed: float) -> None:
+    latency = latency_of(delay, 0.01, [0.04, 0.06, 0.3], speed, horizon=48)
+    if delay == WORLD_WAITS:
+        assert latency is None
+        return
+    assert latency is not None
+    expected = 6 * speed + MARGIN if delay == REAL_TIME else float(delay.removesuffix(" ms")) / 10.0
+    assert latency.lead == np.ceil(expected)
+    latency.close()
+
+
+def test_the_world_waits_for_plans_that_take_longer_than_their_horizon() -> None:
+    assert latency_of(REAL_TIME, 0.01, [0.5], speed=1.0, horizon=48) is None
+    assert latency_of(REAL_TIME, 0.01, [0.5], speed=0.5, horizon=48) is not None
+
+
+def test_figures_count_the_replans_that_missed_their_deadline() -> None:
+    info = PlanInfo(1.0, {"effort": 1.0}, np.zeros((1, 1, 13)), [], np.zeros(0), 8, 8, 0, 0.02, 0.0)
+    records = [
+        PlanRecord(step, 0, np.zeros((1, 13)), Mock(), info, requested=requested, received=received, error=error)
+        for step, requested, received, error in ((0, 0, 0, 0.0), (8, 4, 8, 0.002), (16, 12, 19, np.nan))
+    ]
+    lines = plan_lines(Execution([], [], records), 0.01, 8)
+    assert "late: 1 of 2 replans" in lines
+    assert "begun 40 ms after they are requested, from a prediction that is 2.0 mm off" in lines
+    assert not any("late" in line for line in plan_lines(Execution([], [], records[:1]), 0.01, 8))
 
 
 def test_a_drag_is_a_change_and_requests_are_handed_on_in_order(page: LivePage) -> None:

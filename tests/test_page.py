@@ -22,7 +22,8 @@ from matplotlib.image import imread
 
 from mpc import CEM
 from tasks.kick import Kick
-from tasks.live import Choices, Live
+from tasks.live import Live
+from tasks.live_choices import Choices
 from tasks.presets import Preset
 from viewer import LivePage, Settings, write_html
 from viewer.camera import VIEWS
@@ -298,8 +299,10 @@ def test_the_ball_is_dragged_to_where_it_lies_and_by_how_it_rolls(
         ("Model", "dynamics", "larp"),
         ("Its weights", "weights", "others"),
         ("Reference", "reference", "another"),
+        ("Sensors", "sensors", "lab"),
+        ("Delay", "delay", "25 ms"),
     ],
-    ids=["preset", "model", "weights", "reference"],
+    ids=["preset", "model", "weights", "reference", "sensors", "delay"],
 )
 def test_the_next_plan_is_by_what_is_chosen_from_a_list(
     label: str, field: str, value: str, seen: Page, served: Served
@@ -419,7 +422,7 @@ def test_each_client_looks_from_where_it_likes(view: str, played: Page, served: 
         until(lambda: np.allclose(client.camera.position, stage.camera(view, client.camera.aspect).position, atol=0.05))
 
 
-@pytest.mark.parametrize("ghost", ["prediction", "reference", "fan"])
+@pytest.mark.parametrize("ghost", ["prediction", "reference", "estimate", "fan"])
 def test_ghosts_are_seen_only_if_wished_for(ghost: str, played: Page, served: Served) -> None:
     unfolded(played, f"show {ghost}")
     for shown in (False, True):
@@ -434,6 +437,30 @@ def test_what_is_played_can_be_downloaded(kind: str, begins: bytes, played: Page
         button.click()
     begun.value.save_as(tmp_path / "file")
     assert (tmp_path / "file").read_bytes()[:4] == begins
+
+
+def test_what_sensors_show_is_played_beside_the_truth(seen: Page, served: Served) -> None:
+    seen.get_by_role("tab", name="Kick").click()
+    choose(seen, "Sensors", "noisy")
+    until(lambda: planned_for(served).sensors == "noisy")
+    kicks(served, kick_button(seen).click)
+    choose(seen, "Sensors", "perfect")
+    recording = served.page.recording
+    assert recording is not None and recording.estimated is not None
+    error = np.linalg.norm((recording.estimated - recording.states[:-1])[..., :3], axis=-1)
+    assert 0.0 < np.median(error) < 0.05
+
+
+def test_an_interrupted_kick_leaves_no_thread_that_plans(seen: Page, served: Served) -> None:
+    seen.get_by_role("tab", name="Kick").click()
+    choose(seen, "Model", "larp")  # whose plans are quick enough for real time
+    until(lambda: planned_for(served).dynamics == "larp")
+    kick_button(seen).click()
+    until(lambda: served.page.mode == "running" and any("planning" in thread.name for thread in threading.enumerate()))
+    seen.get_by_text("Reset", exact=True).click()
+    until(lambda: served.page.mode == "planned")
+    assert not any("planning" in thread.name for thread in threading.enumerate())
+    choose(seen, "Model", "mujoco")
 
 
 def test_a_page_of_elsewhere_cannot_connect(browser: Browser, served: Served, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.image import imread
+from page_clients import eventually
 from scipy.spatial.transform import Rotation
 
 from larp_model.bodies import human_and_ball
@@ -125,6 +126,7 @@ def test_nearest_approach_of_a_resting_ball() -> None:
         ("states", np.full((3, len(SCENE.links), 13), np.nan)),
         ("predicted", np.zeros((0, len(SCENE.links), 13))),
         ("reference", np.zeros((len(SCENE.links), 13))),
+        ("estimated", np.full((3, len(SCENE.links), 13), np.inf)),
         ("predicted_start", 60),
         ("target", np.array([1.0, np.nan, 0.0])),
         ("traced", 14),
@@ -143,6 +145,18 @@ def test_prediction_is_aligned_with_the_truth(recording: Recording) -> None:
         expected = recording.predicted_at(row)
         assert expected is not None
         np.testing.assert_allclose(expected[:, 0], recording.states[row, :, 0])
+
+
+def test_an_estimate_is_drawn_beside_the_truth_and_nowhere_else(page: LivePage, recording: Recording) -> None:
+    page.finish(replace(recording, estimated=recording.states[:30]))
+    stage = page._stage
+    assert stage is not None
+    ghost = stage.lane._ghosts["estimate"]._root
+    for row, visible in ((10, True), (50, False)):
+        page.panel.playing = False
+        page.panel.move(row * SCENE.dt - page.panel.time)
+        eventually(lambda: page._drawn_frame is not None and page._drawn_frame[0] == row)  # noqa: B023
+        assert ghost.visible == visible
 
 
 def test_page_follows_and_plays(page: LivePage, recording: Recording, capsys: pytest.CaptureFixture[str]) -> None:

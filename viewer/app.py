@@ -255,12 +255,17 @@ class LivePage:
             self._panel.hide_clock()
 
     def update(
-        self, state: np.ndarray, predicted: np.ndarray | None, time: float, reference: np.ndarray | None = None
+        self,
+        state: np.ndarray,
+        predicted: np.ndarray | None,
+        time: float,
+        reference: np.ndarray | None = None,
+        estimate: np.ndarray | None = None,
     ) -> None:
         """Show the state (L, 13) of the ground truth at `time` [s].
 
         predicted: (H, L, 13), the model's states at time, time + dt, ..., if they were just predicted; otherwise None.
-        reference: state (L, 13), if it is to be drawn.
+        reference, estimate: states (L, 13), if they are to be drawn.
         """
         with self._lock:
             if self._stage is None:
@@ -274,7 +279,7 @@ class LivePage:
                     self._handles.show_all(False)
                 self._panel.hide_clock()
             assert self._live is not None
-            self._live.updates.append(StateUpdate(np.array(state), time, predicted, reference))
+            self._live.updates.append(StateUpdate(np.array(state), time, predicted, reference, estimate))
 
     def finish(self, recording: Recording, beside: Recording | None = None) -> None:
         """Load a recording for replay, and optionally another to be drawn beside it."""
@@ -375,6 +380,7 @@ class LivePage:
                     replayed.states[lane_row],
                     prediction=replayed.predicted_at(lane_row),
                     reference=replayed.reference_at(lane_row),
+                    estimate=replayed.estimate_at(lane_row),
                 )
         self._clients.follow(stage.lane.position(recording.states[min(row, len(recording.states) - 1)]))
         self._drawn_frame = row, ghosts
@@ -393,7 +399,7 @@ class LivePage:
             if is_waiting:
                 step = int(clock.monotonic() / stage.scene.dt * self._panel.speed) % len(plan)
             predicted = plan[step] if 0 <= step < len(plan) else None
-        lane.show(live.state, prediction=predicted, reference=live.reference)
+        lane.show(live.state, prediction=predicted, reference=live.reference, estimate=live.estimate)
         self._frames += 1
         if live.state_is_new:
             path = lane.position(np.array(live.path)) if live.path else None

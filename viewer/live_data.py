@@ -15,17 +15,18 @@ LAG = 5
 
 
 class StateUpdate(NamedTuple):
-    """State (L, 13) of the ground truth at a time [s], the new prediction from there, and the reference's state."""
+    """State (L, 13) of the ground truth at a time [s], the new prediction from there, reference and estimate of it."""
 
     state: np.ndarray
     time: float
     predicted: np.ndarray | None
-    reference: np.ndarray | None
+    reference: np.ndarray | None = None
+    estimate: np.ndarray | None = None
 
 
 @dataclass
 class LiveData:
-    """Data of a kick that is planned or running; a plan, fan or reference that is None is not drawn."""
+    """Data of a kick that is planned or running; a plan, fan, reference or estimate that is None is not drawn."""
 
     state: np.ndarray
     time: float
@@ -34,6 +35,7 @@ class LiveData:
     plan_time: float = 0.0
     fan: tuple[np.ndarray, np.ndarray] | None = None
     reference: np.ndarray | None = None
+    estimate: np.ndarray | None = None
     state_is_new: bool = True  # the state is not drawn yet
     plan_is_new: bool = True  # the plan and its fan are not drawn yet
     updates: deque[StateUpdate] = field(default_factory=deque)
@@ -45,4 +47,5 @@ class LiveData:
             if update.predicted is not None:
                 self.plan, self.plan_time, self.plan_is_new = mask_unpredicted(update.predicted), update.time, True
             self.path.append(update.state)
-            self.state, self.time, self.reference, self.state_is_new = update.state, update.time, update.reference, True
+            self.state, self.time, self.state_is_new = update.state, update.time, True
+            self.reference, self.estimate = update.reference, update.estimate

@@ -17,7 +17,7 @@ from larp_model.files import write_whole
 from larp_model.scene import Scene
 from larp_model.state import SIZE
 from viewer.replay import animation_html, with_caption
-from viewer.scene_view import REFERENCE, SceneView
+from viewer.scene_view import REFERENCE, THIN, SceneView
 from viewer.server import close_server, open_server
 from viewer.stage import ground
 
@@ -74,7 +74,7 @@ def overlay_page(overlay: Overlay) -> str:
         with server.atomic():
             ground(server)
             human = SceneView(server, scene, "/human")
-            start = SceneView(server, scene, "/start", REFERENCE, opacity=0.4)
+            start = SceneView(server, scene, "/start", REFERENCE, 0.4, THIN)
             first_pairs = overlay.at(0)
             points = server.scene.add_point_cloud(
                 "/keypoints", first_pairs[:, 0], KEYPOINT, point_size=0.02, point_shape="circle", precision="float32"

@@ -19,7 +19,7 @@ from viewer.settings import Offer
 SPEEDS = (0.05, 2.0)
 # Actions with a key: name, label of the button, key.
 ACTIONS = (("kick", "Kick", "K"), ("reset", "Reset", "R"), ("play", "Play / pause", "space"), ("step", "Step", "S"))
-GHOSTS = ("prediction", "reference", "fan")
+GHOSTS = ("prediction", "reference", "estimate", "fan")
 FILES = ("html", "png", "gif")
 # Upper bound of a cost's weight, as a multiple of its initial one.
 HEAVIEST = 5.0
@@ -31,6 +31,11 @@ ABOUT = """Drag the magenta target, then **Kick** (key K). The model plans, MuJo
 The ball has two handles: the white ring, where it lies, and the yellow pin, how it rolls.
 
 Thin lines are other candidates, bright ones cheap."""
+
+HINTS = {
+    "sensors": "What the planner gets to see; of anything but perfect sensors a filter estimates the state",
+    "delay": "When plans are executed: in real time they are made beside the world, which goes on by the clock",
+}
 
 OnRequest = Callable[[str, "viser.ClientHandle | None"], None]
 
@@ -119,8 +124,10 @@ class Panel:
             ("dynamics", "Model", offer.dynamics),
             ("weights", "Its weights", offer.weights),
             ("reference", "Reference", offer.references),
+            ("sensors", "Sensors", offer.sensors),
+            ("delay", "Delay", offer.delays),
         ):
-            self._add_setting(name, gui.add_dropdown(label, names, visible=len(names) > 1))
+            self._add_setting(name, gui.add_dropdown(label, names, visible=len(names) > 1, hint=HINTS.get(name)))
         hint = "Seconds that a plan may take; 0: as long as the preset takes"
         self._add_setting("budget", gui.add_slider("Budget [s]", 0.0, offer.longest, 0.05, 0.0, hint=hint))
         with gui.add_folder("Push", expand_by_default=False):
@@ -158,7 +165,7 @@ class Panel:
         gui = self._gui
         with gui.add_folder("View", expand_by_default=self._offer is None):
             self._add_buttons("Camera", {name: f"view {name}" for name in (*VIEWS, "follow")})
-            ghosts = GHOSTS if self._offer else GHOSTS[:2]
+            ghosts = GHOSTS if self._offer else GHOSTS[:3]
             self._ghosts = {name: gui.add_checkbox(f"show {name}", True) for name in ghosts}
             for handle in self._ghosts.values():
 
@@ -194,6 +201,7 @@ class Panel:
         assert offer is not None
         offered = {"preset": offer.presets, "dynamics": offer.dynamics}
         offered |= {"weights": offer.weights, "reference": offer.references}
+        offered |= {"sensors": offer.sensors, "delay": offer.delays}
         chosen: dict[str, Any] = {
             name: option(self._controls[name].value, options) for name, options in offered.items()
         }

@@ -55,6 +55,7 @@ class Recording:
     reference: (T'', L, 13), from row 0 of the ground truth on.
     summary: what to print beside the motion, with units, e.g. {"ball speed": "11.2 m/s"}.
     traced: row in the state of the link whose path is drawn; by default the last, the ball.
+    estimated: (T'', L, 13), what the planner took for the ground truth, from row 0 on.
     """
 
     scene: Scene
@@ -66,10 +67,11 @@ class Recording:
     title: str = ""
     summary: Mapping[str, str] = field(default_factory=dict)
     traced: int = -1
+    estimated: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         links = len(self.scene.links)
-        for name in ("states", "predicted", "reference"):
+        for name in ("states", "predicted", "reference", "estimated"):
             value = getattr(self, name)
             if value is None and name != "states":
                 continue
@@ -122,6 +124,12 @@ class Recording:
 
     def reference_at(self, row: int) -> np.ndarray | None:
         """Return the reference's state (L, 13) at a row of the ground truth, or None beyond its end."""
-        if self.reference is None or row >= len(self.reference):
-            return None
-        return np.asarray(self.reference[row])
+        return _row(self.reference, row)
+
+    def estimate_at(self, row: int) -> np.ndarray | None:
+        """Return the estimate (L, 13) of a row of the ground truth, or None beyond its end."""
+        return _row(self.estimated, row)
+
+
+def _row(states: np.ndarray | None, row: int) -> np.ndarray | None:
+    return None if states is None or row >= len(states) else np.asarray(states[row])

@@ -41,7 +41,10 @@ def page_of(recording: Recording) -> str:
 
         def show(row: int) -> None:
             stage.lane.show(
-                recording.states[row], prediction=recording.predicted_at(row), reference=recording.reference_at(row)
+                recording.states[row],
+                prediction=recording.predicted_at(row),
+                reference=recording.reference_at(row),
+                estimate=recording.estimate_at(row),
             )
 
         page = animation_html(server, len(recording.states), recording.scene.dt, show)

@@ -22,9 +22,11 @@ TRUNK, LEFT, RIGHT = (38, 52, 110), (0, 104, 204), (236, 92, 0)
 BALL_PATCHES = ((246, 246, 243), (38, 40, 46))  # hexagons, pentagons
 # Distinct for all eyes, on the pitch and on white: after Okabe and Ito, but for a target that no lawn hides.
 GROUND_TRUTH, PREDICTION, REFERENCE, TARGET = (213, 94, 0), (0, 114, 178), (250, 250, 250), (204, 20, 122)
+ESTIMATE = (240, 228, 66)
 PITCH, GRID, MARKINGS = (126, 163, 112), (147, 183, 133), (238, 244, 234)
-# Radius of what is translucent, as a share of its own: it shows where it differs from what is not, and hides nothing.
-GHOST_RADIUS = 0.96
+# Radii of ghosts, as multiples of the links': a thin one shows only where it differs from the solid links and does not
+# veil them; a thick one always shows.
+THIN, THICK = 0.96, 1.2
 ZENITH, HORIZON = (118, 166, 214), (230, 239, 246)  # of the sky
 
 
@@ -111,12 +113,13 @@ class Capsules:
         name: str,
         colours: Sequence[Colour],
         opacity: float | None,
+        thickness: float = 1.0,
     ) -> None:
         """Add the capsules to the scene.
 
-        name: in Viser's tree. colours: of each link. opacity: in (0, 1), or None.
+        name: in Viser's tree. colours: of each link. opacity: in (0, 1), or None. thickness: multiplies their radii.
         """
-        radii = np.array([link.radius for link in links]) * (1.0 if opacity is None else GHOST_RADIUS)
+        radii = thickness * np.array([link.radius for link in links])
         self._to_end = np.array([0.5 * link.length * np.array(link.axis) for link in links])
         self._along = Rotation.concatenate([Rotation.align_vectors(link.axis, (0.0, 0.0, 1.0))[0] for link in links])
         self._sizes = np.stack([radii, radii, [link.length for link in links]], axis=-1)
@@ -164,17 +167,19 @@ class SceneView:
         name: str,
         colour: Colour | None = None,
         opacity: float | None = None,
+        thickness: float = 1.0,
     ) -> None:
         """Add the links to the scene.
 
-        name: in Viser's tree. colour: of all links, instead of their own ones. opacity: in (0, 1), or None.
+        name: in Viser's tree. colour: of all links, instead of their own ones. opacity: in (0, 1), or None. thickness:
+        multiplies their radii.
         """
         self._server, self._links = server, len(scene.links)
         self._root = server.scene.add_frame(name, show_axes=False)
         self._balls = {}
         for body in scene.bodies:
             if body.is_ball:
-                node, radius = f"{name}/{body.name}", body.links[0].radius * (1.0 if opacity is None else GHOST_RADIUS)
+                node, radius = f"{name}/{body.name}", thickness * body.links[0].radius
                 self._balls[scene.rows(body.name).start] = server.scene.add_frame(node, show_axes=False)
                 vertices, faces = unit_meshes()[0]
                 meshes = ((radius * vertices, faces),) if colour else football_meshes(radius)
@@ -187,7 +192,7 @@ class SceneView:
         self._rows = np.array([row for row in range(self._links) if row not in self._balls], int)
         links = [scene.links[row] for row in self._rows]
         colours = [colour or link_colour(link) for link in links]
-        self.capsules = Capsules(server, links, f"{name}/capsules", colours, opacity) if links else None
+        self.capsules = Capsules(server, links, f"{name}/capsules", colours, opacity, thickness) if links else None
 
     def update(self, state: np.ndarray | None) -> None:
         """Move the links to a state (L, 13); hide those without a known state (NaN), or all if it is None."""

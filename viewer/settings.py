@@ -14,8 +14,9 @@ class Settings(NamedTuple):
     """Settings of the next kick, as chosen on the page.
 
     target: (3,) [m]. spot: (2,), offset of the ball from its usual position [m]. roll: (2,), its rolling velocity
-    [m/s]. preset, dynamics, weights, reference: names from those offered. budget: seconds that a plan may take; 0: as
-    long as the preset takes. terms: weight of each named cost.
+    [m/s]. preset, dynamics, weights, reference, sensors, delay: names from those offered; sensors are what the planner
+    sees of the state, and delay is that of its plans. budget: seconds that a plan may take; 0: as long as the preset
+    takes. terms: weight of each named cost.
     """
 
     target: tuple[float, ...]
@@ -25,6 +26,8 @@ class Settings(NamedTuple):
     dynamics: str
     weights: str
     reference: str
+    sensors: str
+    delay: str
     budget: float
     terms: Mapping[str, float]
 
@@ -40,6 +43,8 @@ class Offer:
     dynamics: tuple[str, ...]
     weights: tuple[str, ...]
     references: tuple[str, ...]
+    sensors: tuple[str, ...]
+    delays: tuple[str, ...]
     terms: tuple[tuple[str, float], ...]
     target: Box
     spot: Box

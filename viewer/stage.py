@@ -13,6 +13,7 @@ from larp_model.state import POSITION
 from viewer.camera import PictureCamera, View, around
 from viewer.recording import Recording, nearest_approach
 from viewer.scene_view import (
+    ESTIMATE,
     GRID,
     GROUND_TRUTH,
     MARKINGS,
@@ -20,12 +21,14 @@ from viewer.scene_view import (
     PREDICTION,
     REFERENCE,
     TARGET,
+    THICK,
+    THIN,
     Colour,
     SceneView,
     sky,
 )
 
-LEGEND = "orange: truth, blue: prediction, white: reference, magenta: target"
+LEGEND = "orange: truth, blue: prediction, white: reference, yellow: estimate, magenta: target"
 POSTS, NET = (255, 255, 255), (222, 230, 226)
 GOAL = (6.0, 3.0, 2.0)  # m: how far ahead it stands, how wide and how high it is; for scale alone
 GOAL_AREA = (1.5, 5.0)  # m: how far it reaches from the goal, how wide it is
@@ -57,8 +60,9 @@ class Lane:
         self._label = server.scene.add_label(f"{name}/nearest", "target", anchor="bottom-center")
         self._ground_truth = SceneView(server, scene, f"{name}/truth")
         self._ghosts = {
-            "prediction": SceneView(server, scene, f"{name}/prediction", PREDICTION, opacity=0.35),
-            "reference": SceneView(server, scene, f"{name}/reference", REFERENCE, opacity=0.4),
+            "prediction": SceneView(server, scene, f"{name}/prediction", PREDICTION, 0.45, THIN),
+            "reference": SceneView(server, scene, f"{name}/reference", REFERENCE, 0.4, THIN),
+            "estimate": SceneView(server, scene, f"{name}/estimate", ESTIMATE, 0.35, THICK),
         }
         for ghost in self._ghosts.values():
             ghost.update(None)

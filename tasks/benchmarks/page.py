@@ -34,7 +34,8 @@ from mpc.loop import Execution
 from tasks.benchmarks import report
 from tasks.command import prepare_jax, run
 from tasks.kick import USUAL, Kick
-from tasks.live import Choices, Live, due, weights_for
+from tasks.live import Live, due
+from tasks.live_choices import WORLD_WAITS, Choices, weights_for
 from tasks.presets import PRESETS, PresetName
 from tasks.session import Session
 from tasks.targets import random_kick
@@ -202,7 +203,9 @@ def measure(settings: PageSettings, json: Path) -> tuple[dict[str, report.Row], 
     random = np.random.default_rng(settings.seed)
     targets = [random_kick(random)[0] for _ in range(settings.kicks)]
     kick, preset = Kick.standard(), settings.preset
-    choices = Choices({"embedded": lambda: kick}, {preset: PRESETS[preset]}, ("larp",), weights_for(None))
+    choices = Choices(
+        {"embedded": lambda: kick}, {preset: PRESETS[preset]}, ("larp",), weights_for(None), (WORLD_WAITS,)
+    )
     process, begin = psutil.Process(), time.monotonic()
     session = Session(kick)
     session.run(USUAL, preset)  # what plans and steps keeps its threads

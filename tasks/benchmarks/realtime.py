@@ -23,7 +23,7 @@ from tasks.command import prepare_jax, run
 from tasks.kick import USUAL, Kick
 from tasks.models import DynamicsName
 from tasks.presets import PresetName, preset_of
-from tasks.run import plans_of, summary_of
+from tasks.run import summary_of, timing_figures
 from tasks.sensing import EstimatorName, Perception, Sensing
 from tasks.sensors import SensorName
 from tasks.session import Planners, Session
@@ -208,23 +208,6 @@ def estimate_before_contact(kick: Kick, execution: Execution, sense: Perception 
     if sense is None or contact is None:
         return None
     return estimate_errors(kick.scene, sense, states, controls, max(contact - 2, 0))
-
-
-def timing_figures(execution: Execution, dt: float) -> dict[str, Any]:
-    """Return what the replans of an execution in steps of dt [s] made of the time.
-
-    replans: of the whole execution, and of them those missed their deadline: received after the step for which they
-    were made. replans_per_second, prediction_error_m (mean) and lead_ms (mean): of the task itself, without recovery.
-    """
-    replans, own = execution.plans[1:], plans_of(execution)[1:]
-    errors = [plan.error for plan in own if math.isfinite(plan.error)]
-    return {
-        "replans": len(replans),
-        "deadlines_missed": sum(plan.received > plan.step for plan in replans),
-        "replans_per_second": len(own) / (dt * own[-1].received) if own and own[-1].received else 0.0,
-        "prediction_error_m": float(np.mean(errors)) if errors else math.nan,
-        "lead_ms": float(1e3 * dt * np.mean([plan.step - plan.requested for plan in own])) if own else 0.0,
-    }
 
 
 def point_figures(rows: list[dict[str, Any]]) -> dict[str, Any]:
