@@ -13,7 +13,6 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
 
 import jax
 import numpy as np
@@ -29,7 +28,7 @@ from tasks.live_choices import REAL_TIME, Choices, latency_of
 from tasks.live_figures import show_figures
 from tasks.run import REACHABLE, Run, facts, plans_of
 from tasks.sensing import Perception, Sensing
-from tasks.sensors import PERFECT, SENSORS, SensorName
+from tasks.sensors import PERFECT, SENSORS
 from tasks.session import Planners, Session
 from tasks.task import Task
 from viewer import (
@@ -234,8 +233,7 @@ class Live:
         """Return what the chosen sensors make of the states of a kick; None where they are perfect."""
         key = settings.reference, settings.sensors
         if key not in self._sensing:
-            name: SensorName = next(name for name in get_args(SensorName) if name == settings.sensors)
-            self._sensing[key] = Sensing(task.scene, name)
+            self._sensing[key] = Sensing(task.scene, SENSORS[settings.sensors])
         return self._sensing[key].perception(initial_state(task, settings), np.random.default_rng(self.seed))
 
     def _rehearsed(self, task: Task, settings: Settings, world: PushableWorld) -> deque[float]:
