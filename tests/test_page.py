@@ -444,9 +444,10 @@ def test_what_sensors_show_is_played_beside_the_truth(seen: Page, served: Served
     choose(seen, "Sensors", "noisy")
     until(lambda: planned_for(served).sensors == "noisy")
     kicks(served, kick_button(seen).click)
-    choose(seen, "Sensors", "perfect")
     recording = served.page.recording
     assert recording is not None and recording.estimated is not None
+    choose(seen, "Sensors", "perfect")
+    until(lambda: planned_for(served).sensors == "perfect")
     error = np.linalg.norm((recording.estimated - recording.states[:-1])[..., :3], axis=-1)
     assert 0.0 < np.median(error) < 0.05
 
@@ -461,6 +462,7 @@ def test_an_interrupted_kick_leaves_no_thread_that_plans(seen: Page, served: Ser
     until(lambda: served.page.mode == "planned")
     assert not any("planning" in thread.name for thread in threading.enumerate())
     choose(seen, "Model", "mujoco")
+    until(lambda: planned_for(served).dynamics == "mujoco")
 
 
 def test_a_page_of_elsewhere_cannot_connect(browser: Browser, served: Served, tmp_path: Path) -> None:
