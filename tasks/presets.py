@@ -23,8 +23,6 @@ STEPS = GaussNewton(rounds=2, directions=24)
 # time.
 FIRST_TOLERANCE, REPLAN_TOLERANCE = (("target", 0.1),), (("target", 0.05),)
 REPLAN = GaussNewton(rounds=1), Fallback(REPLAN_TOLERANCE, (GaussNewton(rounds=4),))
-# In a world that goes on, a replan that took four rounds more would be outdated when it is there.
-FAST_REPLAN = GaussNewton(rounds=1), Fallback(REPLAN_TOLERANCE, (GaussNewton(rounds=1),))
 RECOVERY = CEM(samples=64, rounds=2, elites=12, decay=1.0)
 
 # Fields of a preset that have another name than they had.
@@ -110,7 +108,7 @@ def _first_stage(rounds: int, *searches_rounds: int) -> Stage:
 # kicks it is not.
 PresetName = Literal["fast", "balanced", "accurate"]
 PRESETS: dict[str, Preset] = {
-    "fast": Preset(_first_stage(4, 8), FAST_REPLAN, interval=4, recovery=(replace(RECOVERY, rounds=1),), feedback=True),
+    "fast": Preset(_first_stage(4, 8), REPLAN, interval=8, recovery=(replace(RECOVERY, rounds=1),), feedback=True),
     "balanced": Preset(_first_stage(16, 16, 64), REPLAN, interval=1, feedback=True),
     "accurate": Preset(_first_stage(16, 16, 64), REPLAN, interval=5, verify=(8, 3)),
 }

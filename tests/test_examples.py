@@ -33,6 +33,7 @@ def test_a_task_from_outside_meets_its_goals(tmp_path: Path, monkeypatch: pytest
         ("own_cost", ()),
         ("own_reference", ()),
         ("own_world", ()),
+        ("own_clock", ()),
         ("own_model", ()),
         ("own_human", ()),
         ("own_scene", (1e-4, 40)),
@@ -84,8 +85,8 @@ def test_the_notebook_runs_and_shows_its_replay(tmp_path: Path, monkeypatch: pyt
 
 
 def test_every_example_is_run() -> None:
-    run = {"pass_to_runner", "own_cost", "own_reference", "own_world", "own_model", "own_human", "own_scene", "batch"}
-    assert {path.stem for path in EXAMPLES.glob("*.py")} == run
+    own = {f"own_{name}" for name in ("cost", "reference", "world", "clock", "model", "human", "scene")}
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == own | {"pass_to_runner", "batch"}
 
 
 def test_examples_are_short() -> None:
