@@ -32,7 +32,7 @@ class Clocked:
         """Send joint targets (1, J, 3) [rad]; return the latest states (1, L, 13), of a later step than the last."""
         self.targets = control
         if self.seen == 0:
-            threading.Thread(target=self.run, daemon=True).start()
+            threading.Thread(target=self.run).start()
         arrived = [self.observations.get(timeout=10.0) for _ in range(max(1, self.observations.qsize()))]
         self.seen, states = arrived[-1]
         return states
@@ -41,8 +41,8 @@ class Clocked:
         """Step until nobody has looked for 50 steps."""
         begin, number = time.monotonic(), 0
         while number < self.seen + 50:
+            time.sleep(max(0.0, begin + PACE * self.dt * (number + 1) - time.monotonic()))
             states, number = self.world.step(self.targets).copy(), number + 1
-            time.sleep(max(0.0, begin + PACE * self.dt * number - time.monotonic()))
             self.observations.put((number, states))
 
 
@@ -50,7 +50,7 @@ def main() -> None:
     """Kick with plans that are made beside the world."""
     kick = Kick.standard()
     session, world = Session(kick), Clocked(Windy(kick), kick.scene.dt)
-    session.run(TARGET, "fast", latency=SimulatedLatency(world.dt, 0.05))  # compiles, before the clock runs
+    session.run(TARGET, "fast", world=world.world, latency=SimulatedLatency(world.dt, 0.05))  # compiles, without a clock
     run = session.run(TARGET, "fast", world=world, latency=PlanningThread(world.dt, 0.05 / PACE))
     print(f"missed by {100 * run.truth_error_m:.1f} cm; {world.seen - len(run.execution.controls)} steps were not seen")
     assert run.summary["touched"] and run.truth_error_m < 1.0
