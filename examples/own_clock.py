@@ -50,7 +50,7 @@ def main() -> None:
     """Kick with plans that are made beside the world."""
     kick = Kick.standard()
     session, world = Session(kick), Clocked(Windy(kick), kick.scene.dt)
-    session.run(TARGET, "fast", world=world.world, latency=SimulatedLatency(world.dt, 0.05))  # compiles, without a clock
+    session.run(TARGET, "fast", world=world.world, latency=SimulatedLatency(world.dt, 0.05))  # compiles
     run = session.run(TARGET, "fast", world=world, latency=PlanningThread(world.dt, 0.05 / PACE))
     print(f"missed by {100 * run.truth_error_m:.1f} cm; {world.seen - len(run.execution.controls)} steps were not seen")
     assert run.summary["touched"] and run.truth_error_m < 1.0
