@@ -11,7 +11,7 @@ from rich.table import Table
 from larp_model import state as packed
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
-from mpc.estimator import Estimate, Observation
+from mpc.estimator import LEAST_VARIANCE, Estimate, Observation
 from tasks.sensing import FromTheStart, Perception, uniform
 from tasks.sensors import coordinates_by_body, rotations
 
@@ -59,6 +59,7 @@ def estimate_errors(
     for name, rows in quantities._asdict().items():
         error = rows @ deviation
         known = rows @ estimate.covariance[: len(deviation), : len(deviation)] @ rows.T
+        known += LEAST_VARIANCE * np.eye(len(rows))  # the last sample of what rests has no error
         figures[name] = {
             "raw": _size(raw[name]),
             "estimate": _size(error),
