@@ -18,7 +18,7 @@ from larp_model.simulator import Simulator
 from mpc.estimator import Estimate, Estimator, KalmanFilter, LastSample, Observation, moved
 from mpc.timeline import Sample, Timeline
 from tasks import sensing, sensors
-from tasks.benchmarks.estimation import least_covariance
+from tasks.benchmarks.estimation import estimate_errors, least_covariance, mean_errors
 from tasks.motions.references import Reference
 
 DT, UNKNOWN = 0.01, np.inf
@@ -298,8 +298,9 @@ def test_where_all_measurements_are_lost_the_estimate_is_a_prediction_and_says_s
     scene: Scene, reference: Reference
 ) -> None:
     blind = dataclasses.replace(sensors.SENSORS["lab"], lost=1.0)
-    perceived = sensing.Sensing(scene, blind).perception(reference.states[0], np.random.default_rng(0))
+    perceived = sensing.Sensing(scene, "lab").perception(reference.states[0], np.random.default_rng(0))
     assert perceived is not None
+    perceived.sensors = sensors.SensorModel(scene, Simulator.of_physics(scene), blind, np.random.default_rng(0))
     for step in range(3):
         perceived(step, reference.states[step], None if not step else np.zeros((len(scene.motors), 3)))
     assert perceived.lost == 3
@@ -340,3 +341,20 @@ def test_for_a_linear_model_the_filter_knows_as_much_as_the_cramer_rao_bound() -
         estimate = perceived.timeline.update(arrived, control, step * DT)
     least = least_covariance(perceived, model, truth, controls, 20)  # type: ignore[arg-type]
     np.testing.assert_allclose(least, estimate.covariance, rtol=1e-3, atol=1e-9)
+
+
+def test_errors_of_the_last_sample_are_those_of_the_sensors(scene: Scene, reference: Reference) -> None:
+    states, no_control = np.asarray(reference.states[:4], float), np.zeros((4, len(scene.motors), 3))
+    errors, noisy = [], sensing.Sensing(scene, "noisy", "none")
+    for seed in range(6):
+        perceived = noisy.perception(states[0], np.random.default_rng(seed))
+        assert perceived is not None
+        for step, state in enumerate(states):
+            perceived(step, state, no_control[0] if step else None)
+        errors.append(estimate_errors(scene, perceived, states, no_control, 3))
+    mean = mean_errors(errors)
+    assert mean["joint_angles"]["raw"] == pytest.approx(np.radians(0.5), rel=0.15)
+    assert mean["ball_position"]["raw"] == pytest.approx(0.005, rel=0.5)
+    for values in mean.values():
+        assert values["estimate"] == pytest.approx(values["raw"], abs=1e-4) and np.isnan(values["bound"])
+        assert np.isfinite(values["normalised"])
