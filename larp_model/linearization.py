@@ -43,12 +43,19 @@ class Coordinates:
     @property
     def count(self) -> int:
         """Return V, half the number of coordinates."""
-        return sum(3 * (len(body.links) + 1) for body in self.scene.bodies)
+        return int(self.by_body()[-1][1].stop)
+
+    def by_body(self) -> list[tuple[Body, slice]]:
+        """Return each body with its part of the V positions, and of the V rates."""
+        ends = np.cumsum([3 * (len(body.links) + 1) for body in self.scene.bodies]).tolist()
+        return [
+            (body, slice(begin, end)) for body, begin, end in zip(self.scene.bodies, [0, *ends], ends, strict=False)
+        ]
 
     def change(self, state: Array, sizes: Array, coordinates: Array) -> Array:
         """Return the change (L, 13, B) of states (L, 13, B) of links of sizes (L, 3, B), by coordinates (2 V, B)."""
         changes = []
-        for body, links, positions, rates in self._by_body(state, sizes, coordinates):
+        for body, links, positions, rates in self._split(state, sizes, coordinates):
             anchors = turned_anchors(links.local_anchors, links.matrices, np.arange(1, len(body.links)), body.parents)
             changes.append(_body_change(body, links.state, anchors, positions, rates))
         return jnp.concatenate(changes)
@@ -58,19 +65,15 @@ class Coordinates:
 
         `difference` to the states before gives the coordinates back, to the second order.
         """
-        return jnp.concatenate([_body_moved(*parts) for parts in self._by_body(state, sizes, coordinates)])
+        return jnp.concatenate([_body_moved(*parts) for parts in self._split(state, sizes, coordinates)])
 
-    def _by_body(
-        self, state: Array, sizes: Array, coordinates: Array
-    ) -> Iterator[tuple[Body, Kinematics, Array, Array]]:
+    def _split(self, state: Array, sizes: Array, coordinates: Array) -> Iterator[tuple[Body, Kinematics, Array, Array]]:
         """Yield each body with its links, positions and rates (n + 1, 3, B)."""
         links = kinematics(self.scene, state, sizes)
-        positions, rates = (half.reshape(-1, 3, half.shape[-1]) for half in jnp.split(coordinates, 2))
-        begin = 0
-        for body in self.scene.bodies:
-            of_body = slice(begin, begin + len(body.links) + 1)
-            yield body, links.of(self.scene, body.name), positions[of_body], rates[of_body]
-            begin = of_body.stop
+        halves = jnp.split(coordinates, 2)
+        for body, part in self.by_body():
+            positions, rates = (half[part].reshape(-1, 3, half.shape[-1]) for half in halves)
+            yield body, links.of(self.scene, body.name), positions, rates
 
     def of(self, state: Array, change: Array) -> Array:
         """Return the coordinates (2 V, B) of changes (L, 13, B) of states (L, 13, B), joints closed or not."""

@@ -128,9 +128,10 @@ class KalmanFilter:
     biased: Sequence[int] = ()
 
     def __post_init__(self) -> None:
-        for name, value, least in (("dt", self.dt, 1e-9), ("change_error", self.change_error, 0.0)):
-            if not least <= value < math.inf:
-                raise InputError(f"{name}: got {value}, needs a finite number {'> 0' if least else '>= 0'}")
+        if not (math.isfinite(self.dt) and self.dt > 0.0):
+            raise InputError(f"dt: got {self.dt}, needs a finite number > 0")
+        if not 0.0 <= self.change_error < math.inf:
+            raise InputError(f"change_error: got {self.change_error}, needs a finite number >= 0")
         if not np.all(np.isfinite(self.process_noise) & (np.asarray(self.process_noise) >= 0.0)):
             raise InputError("process_noise: got numbers that are not finite or negative, needs variances")
 
@@ -215,7 +216,7 @@ class KalmanFilter:
 
         def predict(state: jax.Array, control: jax.Array) -> tuple[jax.Array, jax.Array]:
             following = self.dynamics.rollout(state[None], control[None, None])[:, 0]
-            before, after = (_rates(self.dynamics, states) for states in (state[None], following))
+            before, after = (rates_of(self.dynamics, states) for states in (state[None], following))
             return following[0], (after - before)[0]
 
         return jax.jit(predict)
@@ -231,7 +232,7 @@ class KalmanFilter:
 
 
 Measured = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Of M numbers: innovations (M,), their derivatives (M, n) by the coordinates, the variances (M,) of their errors."""
+"""Innovations (M,) of M measured numbers, derivatives (M, n) by the coordinates, variances (M,) of their errors."""
 
 
 def _of_places(observation: Observation, state: np.ndarray, basis: np.ndarray) -> Measured:
@@ -241,7 +242,7 @@ def _of_places(observation: Observation, state: np.ndarray, basis: np.ndarray) -
         arms, quaternion, by_turn = places - state[origin, packed.POSITION], state[origin, 3:7], basis[origin, 3:7]
         w, v = quaternion[0], quaternion[1:]
         turn = 2.0 * (w * by_turn[1:] - np.outer(v, by_turn[0]) - np.cross(by_turn[1:], v, axis=0))
-        axes = Rotation.from_quat(np.r_[v, w]).as_matrix()
+        axes = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
         # The axes turn with the link: what rests in the world moves backwards in them.
         by_state = by_state - basis[origin, packed.POSITION] + np.cross(arms[:, :, None], turn[None], axis=1)
         places, by_state = arms @ axes, np.einsum("lin,ij->ljn", by_state, axes)
@@ -277,10 +278,11 @@ def _difference(dynamics: Coordinated, state: np.ndarray, reference: np.ndarray)
 
 def rates(dynamics: Coordinated, state: np.ndarray) -> np.ndarray:
     """Return the rates (n / 2,) among the coordinates of a state (L, 13) against the same one at rest."""
-    return np.array(_rates(dynamics, jnp.asarray(state, jnp.float32)[None])[0], float)
+    return np.array(rates_of(dynamics, jnp.asarray(state, jnp.float32)[None])[0], float)
 
 
-def _rates(dynamics: Coordinated, states: jax.Array) -> jax.Array:
+def rates_of(dynamics: Coordinated, states: jax.Array) -> jax.Array:
+    """Return `rates` (N, n / 2) of states (N, L, 13), inside compiled programs."""
     coordinates = dynamics.difference(states, states.at[..., packed.VELOCITY.start :].set(0.0))
     return coordinates[..., coordinates.shape[-1] // 2 :]
 

@@ -10,13 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from larp_model import state as packed
 from larp_model.errors import InputError
 from larp_model.names import require_known
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from mpc.dynamics import Coordinated
-from mpc.estimator import Estimate, Estimator, KalmanFilter, LastSample, Observation, moved, rates
+from mpc.estimator import Estimate, Estimator, KalmanFilter, LastSample, Observation, moved, rates, rates_of
 from mpc.timeline import Sample, Timeline
 from tasks.sensors import PERFECT, SENSORS, SensorModel, SensorName, Sensors, biased_coordinates
 
@@ -44,7 +43,7 @@ UNIFORM = ModelErrors((0.0, 0.0, 0.0, 0.01), (0.0, 0.0, 0.0003, 0.1))
 START = ModelErrors((0.01, 0.02, 0.03, 0.1), (0.1, 1.0, 1.0, 10.0))
 
 
-def of_coordinates(scene: Scene, errors: ModelErrors) -> np.ndarray:
+def coordinate_variances(scene: Scene, errors: ModelErrors) -> np.ndarray:
     """Return the variances (n,) of the coordinates of a scene's states; see `larp_model.linearization`."""
     halves: tuple[list[float], list[float]] = ([], [])
     for body in scene.bodies:
@@ -56,7 +55,7 @@ def of_coordinates(scene: Scene, errors: ModelErrors) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Uniform:
+class UniformMotion:
     """Dynamics in which all rates stay as they are; joint targets have no effect."""
 
     dynamics: Coordinated
@@ -67,10 +66,8 @@ class Uniform:
         """See `mpc.Dynamics`."""
         states = [state]
         for _ in range(controls.shape[1]):
-            at_rest = states[-1].at[..., packed.VELOCITY.start :].set(0.0)
-            speeds = self.dynamics.difference(states[-1], at_rest)
-            half = speeds.shape[-1] // 2
-            change = jnp.concatenate([self.dt * speeds[..., half:], jnp.zeros_like(speeds[..., half:])], axis=-1)
+            speeds = rates_of(self.dynamics, states[-1])
+            change = jnp.concatenate([self.dt * speeds, jnp.zeros_like(speeds)], axis=-1)
             states.append(self.dynamics.moved(states[-1], change))
         return jnp.stack(states[1:], axis=1)
 
@@ -88,8 +85,8 @@ class Uniform:
 
 
 @dataclass(frozen=True)
-class FromTheStart:
-    """Filter that is another one until time 0."""
+class TwoPhaseFilter:
+    """Filter of uniform motion until time 0, and of the model from then on."""
 
     before: KalmanFilter
     after: KalmanFilter
@@ -153,10 +150,10 @@ class Sensing:
         self.estimator: Estimator = LastSample(self.dynamics)
         if estimator == "filter":
             filters = (
-                KalmanFilter(dynamics, scene.dt, of_coordinates(scene, errors), CHANGE_ERROR, self._biased)
-                for dynamics, errors in ((Uniform(self.dynamics, scene.dt), UNIFORM), (self.dynamics, STEP))
+                KalmanFilter(dynamics, scene.dt, coordinate_variances(scene, errors), CHANGE_ERROR, self._biased)
+                for dynamics, errors in ((UniformMotion(self.dynamics, scene.dt), UNIFORM), (self.dynamics, STEP))
             )
-            self.estimator = FromTheStart(*filters)
+            self.estimator = TwoPhaseFilter(*filters)
 
     def perception(self, start: np.ndarray, random: np.random.Generator) -> Perception | None:
         """Return a perception of states from `start` (L, 13) on; None where the sensors are perfect.
@@ -166,9 +163,9 @@ class Sensing:
         if self.sensors == PERFECT:
             return None
         dt, steps = self.scene.dt, round(BEFORE / self.scene.dt)
-        variance = of_coordinates(self.scene, START)
+        variance = coordinate_variances(self.scene, START)
         errors = np.sqrt(variance) * random.standard_normal(len(variance))
-        expected = moved(self.dynamics, uniform(self.dynamics, start, -steps * dt), errors)
+        expected = moved(self.dynamics, moved_uniformly(self.dynamics, start, -steps * dt), errors)
         biases = np.full(len(self._biased), self.sensors.bias**2)
         first = self.estimator.init(expected, np.concatenate([variance, biases]), -steps * dt)
         model = SensorModel(self.scene, self.dynamics, self.sensors, random)
@@ -176,13 +173,13 @@ class Sensing:
         no_control = np.zeros((len(self.scene.motors), 3))
         for step in range(-steps, 1):
             time, control = step * dt, None if step == -steps else no_control
-            samples = model.measure(uniform(self.dynamics, start, time), time) if step else []
+            samples = model.measure(moved_uniformly(self.dynamics, start, time), time) if step else []
             perception.timeline.update(samples, control, time)
             perception.samples += [samples] if step else []
         return perception
 
 
-def uniform(dynamics: Coordinated, state: np.ndarray, time: float) -> np.ndarray:
+def moved_uniformly(dynamics: Coordinated, state: np.ndarray, time: float) -> np.ndarray:
     """Return the state (L, 13) to which uniform motion leads from a state (L, 13) in a time [s], before it if < 0."""
     speeds = rates(dynamics, state)
     return moved(dynamics, state, np.concatenate([time * speeds, np.zeros_like(speeds)]))

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from larp_model import state as packed
 from larp_model.errors import InputError
-from larp_model.scene import Body, Scene
+from larp_model.linearization import Coordinates
+from larp_model.scene import Scene
 from mpc.dynamics import Coordinated
 from mpc.estimator import Observation, moved, rates
 from mpc.timeline import Sample
@@ -21,7 +22,7 @@ SensorName = Literal["perfect", "noisy", "lab", "onboard"]
 
 @dataclass(frozen=True)
 class BallCamera:
-    """BallCamera at a human's root that sees where a ball is, from there and in the root's axes.
+    """Camera at a human's root that sees where a ball is, from there and in the root's axes.
 
     noise: standard deviation of each component of the ball's place, as a share of its distance; and its bounds [m].
     rate: pictures a second. delay: after which the ball's place is known [s]. lost: share of pictures without a ball.
@@ -109,23 +110,13 @@ GROUND_ERRORS = 0.001, 0.1
 RESTING = 0.01
 
 
-def coordinates_by_body(scene: Scene) -> list[tuple[Body, slice]]:
-    """Return each body of a scene with its part of one half of the coordinates of states, see `linearization`."""
-    parts, begin = list[tuple[Body, slice]](), 0
-    for body in scene.bodies:
-        end = begin + 3 * (len(body.links) + 1)
-        parts.append((body, slice(begin, end)))
-        begin = end
-    return parts
-
-
 class SensorModel:
     """Sensors of a scene, which measure true states, and the errors that they make."""
 
     def __init__(self, scene: Scene, dynamics: Coordinated, sensors: Sensors, random: np.random.Generator) -> None:
         """Begin at the time of the first measurement. random: of the errors."""
         self._dynamics, self._sensors, self._random = dynamics, sensors, random
-        self._balls = [(body, own) for body, own in coordinates_by_body(scene) if body.is_ball]
+        self._balls = [(body, own) for body, own in Coordinates(scene).by_body() if body.is_ball]
         self._scene, self._positions = scene, position_errors(scene, sensors)
         self._human = np.concatenate([np.full(len(body.links), not body.is_ball) for body in scene.bodies])
         self._sees_ball = ~self._human & math.isfinite(sensors.ball)
@@ -199,7 +190,7 @@ class SensorModel:
 
 def rotations(states: np.ndarray) -> Rotation:
     """Return the orientations of states (*, 13)."""
-    return Rotation.from_quat(np.roll(states[..., packed.ORIENTATION], -1, axis=-1))
+    return Rotation.from_quat(states[..., packed.ORIENTATION], scalar_first=True)
 
 
 def position_errors(scene: Scene, sensors: Sensors) -> np.ndarray:
@@ -216,4 +207,4 @@ def biased_coordinates(scene: Scene, sensors: Sensors) -> list[int]:
     """Return the numbers of the coordinates that are measured with a bias: all angles of humans."""
     if not sensors.bias:
         return []
-    return [n for body, own in coordinates_by_body(scene) if not body.is_ball for n in range(own.start + 3, own.stop)]
+    return [n for body, own in Coordinates(scene).by_body() if not body.is_ball for n in range(own.start + 3, own.stop)]

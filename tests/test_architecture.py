@@ -366,3 +366,12 @@ def test_no_docstring_begins_with_a_question_word() -> None:
     words = ("What", "How", "Whether", "Which", "Where", "When", "Why", "Who", "Of")
     first = [(node.name, (ast.get_docstring(node) or "-").split()[0]) for node in documented()]
     assert not [name for name, word in first if word in words]
+    # Those of modules and of type aliases as well.
+    texts = [
+        node.value.value
+        for room in ("larp_model", "mpc", "viewer", "tasks")
+        for file in (ROOT / room).rglob("*.py")
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+    ]
+    assert not [text for text in texts if text.split()[0] in words]

@@ -331,7 +331,7 @@ def test_for_a_linear_model_the_filter_knows_as_much_as_the_cramer_rao_bound() -
     random, model = np.random.default_rng(0), LinearSled()
     truth, controls = paths(random, 0.02, 20)
     sled = KalmanFilter(model, DT, np.r_[np.zeros(3), np.full(3, 0.02**2)])
-    both = sensing.FromTheStart(sled, sled)
+    both = sensing.TwoPhaseFilter(sled, sled)
     start = both.init(STATE, 0.01 * ONES, -0.05)
     perceived = sensing.Perception(None, Timeline(both, start), DT, start)  # type: ignore[arg-type]
     for step in range(-5, 21):

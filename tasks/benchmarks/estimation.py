@@ -9,11 +9,12 @@ import numpy as np
 from rich.table import Table
 
 from larp_model import state as packed
+from larp_model.linearization import Coordinates
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from mpc.estimator import LEAST_VARIANCE, Estimate, Observation
-from tasks.sensing import FromTheStart, Perception, uniform
-from tasks.sensors import coordinates_by_body, rotations
+from tasks.sensing import Perception, TwoPhaseFilter, moved_uniformly
+from tasks.sensors import rotations
 
 # Steps of a kick for which the model's derivatives are computed, always as many: another number is compiled again.
 STEPS = 60
@@ -33,7 +34,7 @@ class Quantities(NamedTuple):
     @classmethod
     def of(cls, scene: Scene) -> Quantities:
         """Return those of a scene with one human and one ball."""
-        parts = coordinates_by_body(scene)
+        parts = Coordinates(scene).by_body()
         (human,), (ball,) = ([own for body, own in parts if body.is_ball == is_ball] for is_ball in (False, True))
         half = parts[-1][1].stop
         unit = np.eye(2 * half)
@@ -82,7 +83,7 @@ def least_covariance(
     """
     estimator, start, dt = perception.timeline.estimator, perception.start, perception.dt
     count = len(start.covariance) - len(start.bias)
-    if not isinstance(estimator, FromTheStart) or step > STEPS:
+    if not isinstance(estimator, TwoPhaseFilter) or step > STEPS:
         return np.full((count, count), math.nan)
     before = round(-start.time / dt)
     rows = np.minimum(np.arange(STEPS), len(controls) - 1)
@@ -102,7 +103,7 @@ def least_covariance(
             transition[:count, :count] = in_uniform_motion if number <= 0 else derivatives[number - 1]
             covariance = transition @ covariance @ transition.T
             covariance[:count, :count] += np.diag(part.process_noise)
-        truth = states[number] if number >= 0 else uniform(simulator, states[0], number * dt)
+        truth = states[number] if number >= 0 else moved_uniformly(simulator, states[0], number * dt)
         for observation in observations:
             covariance = part.corrected(Estimate(0.0, truth, covariance, start.bias), observation).covariance
     return covariance[:count, :count]
