@@ -86,7 +86,7 @@ def free_memory() -> float:
 
     Of several GPUs, which share a batch, that of all together.
     """
-    statistics = [device.memory_stats() for device in jax.devices()]
+    statistics = [device.memory_stats() for device in jax.local_devices()]
     if all(statistics):
         return float(sum(values["bytes_limit"] - values["bytes_in_use"] for values in statistics))
     with suppress(OSError, StopIteration):

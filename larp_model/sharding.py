@@ -1,4 +1,6 @@
-"""Batches shared evenly among all devices, by `jax.sharding`: rows of a batch do not depend on each other.
+"""Batches shared evenly among a process's devices, by `jax.sharding`: rows of a batch do not depend on each other.
+
+Under `jax.distributed` too each process takes its own devices: plans of several hosts do not depend on each other either.
 
 The cores of a CPU are devices too (`runtime.prepare_compiler`): XLA takes hardly more than one core for a program whose
 arrays are as small as a scene's.
@@ -25,7 +27,7 @@ def shared(function: Callable[..., Array], count: int, arguments: tuple[Any, ...
     takes all where the devices do not divide the rows or have fewer than `LEAST_ROWS` each, and where the number is a
     symbol (`jax.export`) or the user has chosen a device (`jax.default_device`).
     """
-    devices = jax.devices()
+    devices = jax.local_devices()
     chosen = jax.config.jax_default_device is not None  # type: ignore[attr-defined]
     if len(devices) == 1 or chosen or not isinstance(count, int):
         return function(*arguments)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -34,6 +34,21 @@ class Inputs(NamedTuple):
     steps: Any | None  # (), so many of the H are computed
 
 
+class Rows(NamedTuple):
+    """Candidates to roll out, each from its own start and around its own reference."""
+
+    starts: Any  # (N, L, 13)
+    references: Any  # (N, H, J, 3) rad
+    knots: Any  # (N, K, J, 3) rad
+
+
+def rows_of(inputs: Inputs, knots: Any) -> Rows:
+    """Return the rows of knots (N, K, J, 3) of one plan, as arrays of NumPy, or of JAX where those are."""
+    of = np if isinstance(knots, np.ndarray) else jnp
+    starts, references = (of.broadcast_to(leaf, (len(knots), *leaf.shape)) for leaf in (inputs.state, inputs.reference))
+    return Rows(starts, references, knots)
+
+
 @dataclass(frozen=True, eq=False)
 class Equations:
     """The planner's equations as pure functions of arrays; see `planner.Planner`, which states them.
@@ -54,11 +69,10 @@ class Equations:
         times = jnp.asarray(self.knot_times), jnp.asarray(self.control_times)
         return jnp.clip(reference + interpolate(knots, *times, self.interpolation), self.lower, self.upper)
 
-    def roll_out(self, dynamics: Dynamics, inputs: Inputs, knots: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return states (N, H', L, 13) and controls (N, H, J, 3) of knots (N, K, J, 3)."""
-        controls = jax.vmap(self.controls, (0, None))(knots, inputs.reference)
-        start = jnp.broadcast_to(inputs.state, (len(knots), *inputs.state.shape))
-        return dynamics.rollout(start, controls, **({} if inputs.steps is None else {"steps": inputs.steps})), controls
+    def roll_out(self, dynamics: Dynamics, rows: Rows, steps: jax.Array | None) -> tuple[jax.Array, jax.Array]:
+        """Return states (N, H', L, 13) and controls (N, H, J, 3) of N rows; steps: see `Inputs`."""
+        controls = jax.vmap(self.controls)(rows.knots, rows.references)
+        return dynamics.rollout(rows.starts, controls, **({} if steps is None else {"steps": steps})), controls
 
     def weigh(
         self, inputs: Inputs, states: jax.Array, controls: jax.Array, corrections: Any
@@ -78,7 +92,7 @@ class Equations:
         """Return gradients (N, K, J, 3) of the costs of knots (N, K, J, 3), the result of `weigh`, and the states."""
 
         def total_cost(knots: jax.Array) -> tuple[jax.Array, Any]:
-            states, controls = self.roll_out(dynamics, inputs, knots)
+            states, controls = self.roll_out(dynamics, rows_of(inputs, knots), inputs.steps)
             results = self.weigh(inputs, states, controls, corrections)
             return jnp.sum(results[0]), (results, states)
 
@@ -89,7 +103,8 @@ class Equations:
         """Return derivatives (D, ...) of the residuals at knots (K, J, 3) along directions (D, K, J, 3)."""
 
         def residuals_of(knots: jax.Array) -> Any:
-            states, controls = (leaf[0] for leaf in self.roll_out(dynamics, inputs, knots[None]))
+            rollout = self.roll_out(dynamics, rows_of(inputs, knots[None]), inputs.steps)
+            states, controls = (leaf[0] for leaf in rollout)
             return residuals(self.terms, states, controls, inputs.context)
 
         return jax.vmap(lambda direction: jax.jvp(residuals_of, (knots,), (direction,))[1])(directions)
@@ -156,6 +171,18 @@ class Programs:
         return jax.block_until_ready(self._compiled[signature](*arguments))
 
 
+RollOut = Callable[[Rows], tuple[Any, Any]]
+"""rows of one size -> states (N, H', L, 13), controls (N, H, J, 3)."""
+Rollouts = Callable[[Hashable, RollOut, Rows, int], tuple[Any, Any]]
+"""(what the rows share, their rollout, N rows, size >= N) -> its results for so many rows, the last one repeated."""
+
+
+def filled_up(key: Hashable, roll_out: RollOut, rows: Rows, size: int) -> tuple[Any, Any]:
+    """Return the `Rollouts` of one plan alone."""
+    numbers = np.minimum(np.arange(size), len(rows.knots) - 1)
+    return roll_out(Rows(*(leaf[numbers] for leaf in rows)))
+
+
 @dataclass
 class Record:
     """Record of the candidates that were evaluated while one plan was made."""
@@ -175,6 +202,7 @@ class PlannerProblem:
     warm_start: np.ndarray
     corrections: Residuals = field(default_factory=dict)
     record: Record = field(default_factory=Record)
+    rollouts: Rollouts = filled_up
     cache: dict[bytes, Evaluations] = field(default_factory=dict)
     """Results of the best candidate of each batch, by its knots."""
 
@@ -237,10 +265,15 @@ class PlannerProblem:
     def _roll_out(self, dynamics: Dynamics, knots: np.ndarray, size: int) -> tuple[Any, Any]:
         """Return the result of `weigh` for knots, and their states: `size` at a time, the last ones filled up."""
         name, batches = ("roll out", self.run.number(dynamics)), list[tuple[Any, Any]]()
-        roll_out, arguments = program_of(self.equations.roll_out, dynamics)
+        function, arguments = program_of(self.equations.roll_out, dynamics)
+
+        def roll_out(rows: Rows) -> tuple[Any, Any]:
+            result: tuple[Any, Any] = self.run(name, function, *arguments, rows, self.inputs.steps)
+            return result
+
         for begin in range(0, len(knots), size):
-            rows = np.minimum(np.arange(begin, begin + size), len(knots) - 1)
-            states, controls = self.run(name, roll_out, *arguments, self.inputs, knots[rows])
+            rows = rows_of(self.inputs, knots[begin : begin + size])
+            states, controls = self.rollouts((*name, size), roll_out, rows, size)
             results = self.run("weigh", self.equations.weigh, self.inputs, states, controls, self.corrections)
             batches.append((results, states))
         if len(knots) == size:

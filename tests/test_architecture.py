@@ -74,6 +74,7 @@ ORDER = [
     "mpc.verified",
     "mpc.fallback",
     "mpc.problem",
+    "mpc.batch",
     "mpc.planner",
     "mpc.loop",
     "mpc.realtime",

@@ -1,0 +1,109 @@
+"""Several plans made side by side: whatever they roll out at a time is rolled out as one batch.
+
+The optimisers of each plan run in a thread of its own, one thread at a time. Once every plan waits for a rollout, or is
+made, their rows are rolled out together.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+
+from mpc.problem import RollOut, Rows
+
+Result = TypeVar("Result")
+
+
+@dataclass(eq=False)
+class Request:
+    """Rows that a plan waits for. Requests with the same key can be rolled out together, by any one's `roll_out`."""
+
+    key: Hashable
+    roll_out: RollOut
+    rows: Rows
+    size: int
+    result: Any = None
+    error: BaseException | None = None
+
+
+@dataclass(eq=False)
+class SharedRollouts:
+    """Rollouts of plans that are made side by side, so many of them at first."""
+
+    running: int
+    waiting: list[Request] = field(default_factory=list)
+    _turn: threading.Condition = field(default_factory=threading.Condition)
+
+    def make(self, jobs: Sequence[Callable[[], Result]]) -> list[Result]:
+        """Return the results of jobs, which call `roll_out`; raises the first one's error, once all have ended."""
+        results: dict[int, Result] = {}
+        errors: dict[int, BaseException] = {}
+
+        def run(number: int) -> None:
+            with self._turn:
+                try:
+                    results[number] = jobs[number]()
+                except BaseException as error:
+                    errors[number] = error
+                finally:
+                    self.running -= 1
+                    self._answer()
+
+        threads = [threading.Thread(target=run, args=(number,), name=f"plan {number}") for number in range(len(jobs))]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        for number in sorted(errors):
+            raise errors[number]
+        return [results[number] for number in range(len(jobs))]
+
+    def roll_out(self, key: Hashable, roll_out: RollOut, rows: Rows, size: int) -> Any:
+        """Return results as `problem.Rollouts` do, once every job waits for them or has ended; called by a job."""
+        request = Request(key, roll_out, rows, size)
+        self.waiting.append(request)
+        self.running -= 1
+        self._answer()
+        self._turn.wait_for(lambda: request.result is not None or request.error is not None)
+        if request.error is not None:
+            raise request.error
+        return request.result
+
+    def _answer(self) -> None:
+        """Roll out what plans wait for, if all of them wait."""
+        if self.running or not self.waiting:
+            return
+        requests, self.waiting = self.waiting, []
+        by_key: dict[Hashable, list[Request]] = {}
+        for request in requests:
+            by_key.setdefault(request.key, []).append(request)
+        for together in by_key.values():
+            try:
+                answer(together)
+            except BaseException as error:
+                for request in together:
+                    request.error = error
+        self.running = len(requests)
+        self._turn.notify_all()
+
+
+def answer(requests: Sequence[Request]) -> None:
+    """Give requests with the same key their results."""
+    size = requests[0].size
+    ends = np.cumsum([len(request.rows.knots) for request in requests])
+    all_rows = Rows(*(np.concatenate(leaves) for leaves in zip(*(request.rows for request in requests), strict=True)))
+    # On a CPU wider programs are not faster; elsewhere there are at most log2 of the number of plans.
+    chunk = size if jax.default_backend() == "cpu" else size << (-(-int(ends[-1]) // size) - 1).bit_length()
+    parts = list[Any]()
+    for begin in range(0, int(ends[-1]), chunk):
+        rows = np.minimum(np.arange(begin, begin + chunk), int(ends[-1]) - 1)
+        parts.append(requests[0].roll_out(Rows(*(leaf[rows] for leaf in all_rows))))
+    results = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    for request, end in zip(requests, ends.tolist(), strict=True):
+        rows = np.minimum(np.arange(end - len(request.rows.knots), end - len(request.rows.knots) + size), end - 1)
+        request.result = jax.tree.map(lambda leaf, rows=rows: leaf[rows], results)
