@@ -1,6 +1,6 @@
 """Batches shared evenly among a process's devices, by `jax.sharding`: rows of a batch do not depend on each other.
 
-Under `jax.distributed` too each process takes its own devices: plans of several hosts do not depend on each other either.
+Under `jax.distributed` too each process takes its own devices: plans of several hosts are independent as well.
 
 The cores of a CPU are devices too (`runtime.prepare_compiler`): XLA takes hardly more than one core for a program whose
 arrays are as small as a scene's.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -83,6 +83,15 @@ def _require(name: str, value: float, most: float) -> None:
         raise InputError(f"{name}: got {value}, needs a number {'>= 0' if most == math.inf else f'from 0 to {most:g}'}")
 
 
+class GroundContact(NamedTuple):
+    """Limits within which a link is seen to rest or roll on the ground, and the errors of what is then known of it."""
+
+    height: float  # m, of its lowest point at most
+    speed: float  # m/s, of that point at most
+    height_error: float  # m, standard deviation of its height from 0
+    speed_error: float  # m/s, of each component of its velocity from 0
+
+
 PERFECT = Sensors()
 SENSORS: dict[str, Sensors] = {
     "perfect": PERFECT,
@@ -102,10 +111,9 @@ SENSORS: dict[str, Sensors] = {
         lost=0.01,
     ),
 }
-# A link rests or rolls on the ground where its lowest point is so low [m] and so slow [m/s]; standard deviations of
-# both from 0.
-LOW, SLOW = 0.01, 0.1
-GROUND_ERRORS = 0.001, 0.1
+# A ball touches the ground in one point, without deformation. Where its height is off by 0.1 mm, the model throws it up
+# or drops it at 1 cm/s: heights known to a millimetre alone would make it bounce.
+HUMAN_CONTACT, BALL_CONTACT = GroundContact(0.01, 0.1, 0.001, 0.05), GroundContact(0.001, 0.01, 0.0001, 0.005)
 # A ball is seen to rest where its speed is below this [m/s].
 RESTING = 0.01
 
@@ -175,8 +183,9 @@ class SensorModel:
         arms = -np.sign(halves[:, 2:]) * halves
         arms[:, 2] -= self._radii
         speeds = state[:, packed.VELOCITY] + np.cross(state[:, packed.ANGULAR_VELOCITY], arms)
-        touching = links & (state[:, 2] + arms[:, 2] < LOW) & (np.linalg.norm(speeds, axis=1) < SLOW)
-        variance = np.where(touching[:, None], np.square(GROUND_ERRORS), math.inf)
+        height, speed, *errors = np.where(self._human[:, None], HUMAN_CONTACT, BALL_CONTACT).T
+        touching = links & (state[:, 2] + arms[:, 2] < height) & (np.linalg.norm(speeds, axis=1) < speed)
+        variance = np.where(touching[:, None], np.square(errors).T, math.inf)
         return observation._replace(ground_arms=arms, ground_variance=variance)
 
     def _errors(self, state: np.ndarray) -> np.ndarray:

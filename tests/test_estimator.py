@@ -294,11 +294,25 @@ def test_pictures_arrive_late_at_their_rate_and_show_the_ball_from_the_root(scen
     np.testing.assert_allclose(in_world, state[ball, :3], atol=1e-6)
 
 
+@pytest.fixture(scope="module")
+def lab(scene: Scene) -> sensing.Sensing:
+    return sensing.Sensing(scene, "lab")
+
+
+def test_a_ball_that_rests_does_not_bounce_in_the_estimate(lab: sensing.Sensing, reference: Reference) -> None:
+    perceived = lab.perception(reference.states[0], np.random.default_rng(0))
+    assert perceived is not None
+    for step in range(20):
+        perceived(step, reference.states[step], None if not step else np.zeros((len(lab.scene.motors), 3)))
+    velocities = [estimate.state[lab.scene.rows(lab.scene.ball.name).start, 7:10] for estimate in perceived.estimates]
+    assert np.abs(velocities).max() < 0.02
+
+
 def test_where_all_measurements_are_lost_the_estimate_is_a_prediction_and_says_so(
-    scene: Scene, reference: Reference
+    scene: Scene, lab: sensing.Sensing, reference: Reference
 ) -> None:
     blind = dataclasses.replace(sensors.SENSORS["lab"], lost=1.0)
-    perceived = sensing.Sensing(scene, "lab").perception(reference.states[0], np.random.default_rng(0))
+    perceived = lab.perception(reference.states[0], np.random.default_rng(0))
     assert perceived is not None
     perceived.sensors = sensors.SensorModel(scene, Simulator.of_physics(scene), blind, np.random.default_rng(0))
     for step in range(3):

@@ -116,6 +116,11 @@ class RealtimePoint(NamedTuple):
         return f"{self.dynamics}, {self.preset}, every {self.interval}; {self.sees}"
 
     @property
+    def without_interval(self) -> str:
+        """Return all of the point but its interval as text."""
+        return f"{self.dynamics}, {self.preset}; {self.sees}, {delay_text(self.delay)}"
+
+    @property
     def sees(self) -> str:
         """Return the sensors and the estimator as text."""
         return "the state" if self.sensors == "perfect" else f"{self.sensors}, {self.estimator}"
@@ -274,6 +279,12 @@ def picture(figures: dict[RealtimePoint, dict[str, Any]]) -> Figure:
             over_delay.annotate(point.delay, place, (6, 4), textcoords="offset points", fontsize=8)
         rates = [value["replans_per_second"] for value in own.values()]
         over_rate.scatter(rates, misses.values(), color=colour)
+    for name in dict.fromkeys(point.without_interval for point in figures):
+        own_values = [value for point, value in figures.items() if point.without_interval == name]
+        if len(own_values) > 1:
+            line = sorted((value["replans_per_second"], 100.0 * value["mean_truth_error_m"]) for value in own_values)
+            over_rate.plot(*zip(*line, strict=True), "-", c="0.6", zorder=0)
+            over_rate.annotate(name, line[-1], (0, 8), textcoords="offset points", fontsize=8, ha="right")
     for axes, label in ((over_delay, "delay [ms]"), (over_rate, "replans a second")):
         axes.set(xlabel=label, ylabel="mean miss in MuJoCo [cm]", ylim=(0.0, 1.25 * highest))
         axes.grid(color="0.92")
@@ -316,7 +327,8 @@ def main(
     """
     settings = RealtimeSettings(targets, seed, delay, preset, dynamics, interval, substeps, sensors, estimator, rolling)
     settings.check()
-    json = json or Path(f"runs/benchmarks/realtime_{'_'.join(sensors)}.json")
+    name = f"realtime_{'_'.join(sensors)}" + (f"_rolling_{rolling:g}".replace(".", "_") if rolling else "")
+    json = json or Path(f"runs/benchmarks/{name}.json")
     report.ready(json, publish)
     prepare_jax()
     points = settings.points()
@@ -332,7 +344,6 @@ def main(
     report.write_picture(json.with_suffix(".png"), picture(figures))
     table = table_of(figures, settings)
     report.show(table)
-    name = f"realtime_{'_'.join(sensors)}" + (f"_rolling_{rolling:g}".replace(".", "_") if rolling else "")
     if publish:
         report.publish(name, f"Real time, {targets} targets", settings.command, table)
     errors = {point.name: value["estimate"] for point, value in figures.items() if value["estimate"]}
