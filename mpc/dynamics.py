@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, TypeGuard, runtime_checkable
+from functools import partial
+from typing import Any, Protocol, TypeGuard, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -171,3 +173,12 @@ def of_steps(dynamics: Linearizable | Continued) -> Linearizable:
 def continued(dynamics: Dynamics, states: jax.Array) -> jax.Array:
     """Return the states (N, H', L, 13) of a rollout from those of its H steps under control, (N, H, L, 13)."""
     return dynamics.continued(states) if isinstance(dynamics, Continued) else states
+
+
+def program_of(function: Callable[..., Any], dynamics: Dynamics) -> tuple[Callable[..., Any], tuple[Dynamics, ...]]:
+    """Return the function to compile of one whose first argument are dynamics, and its leading arguments.
+
+    Dynamics that are a pytree of arrays are an argument: others of the same structure then need not be compiled again.
+    """
+    traced = all(isinstance(leaf, jax.Array | np.ndarray) for leaf in jax.tree.leaves(dynamics))
+    return (function, (dynamics,)) if traced else (partial(function, dynamics), ())

@@ -17,9 +17,9 @@ The biases b of sensors, constant and unknown, are estimated as further coordina
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 from larp_model import state as packed
 from larp_model.errors import InputError
 from larp_model.runtime import one_blas_thread
-from mpc.dynamics import Coordinated
+from mpc.dynamics import Coordinated, program_of
 
 # Variance, in units of its coordinate, below which a measurement counts as exact.
 LEAST_VARIANCE = 1e-10
@@ -212,23 +212,31 @@ class KalmanFilter:
 
     @cached_property
     def _predict(self) -> Any:
-        """Return the compiled step (state, control) -> the next state, and the changes (n / 2,) of rates."""
-
-        def predict(state: jax.Array, control: jax.Array) -> tuple[jax.Array, jax.Array]:
-            following = self.dynamics.rollout(state[None], control[None, None])[:, 0]
-            before, after = (rates_of(self.dynamics, states) for states in (state[None], following))
-            return following[0], (after - before)[0]
-
-        return jax.jit(predict)
+        """Return the compiled `predicted` of the dynamics."""
+        return _compiled(predicted, self.dynamics)
 
     @cached_property
     def _compare(self) -> Any:
-        """Return the compiled function (state, measured) -> coordinates (n,) of the latter, basis (L, 13, n)."""
+        """Return the compiled `compared` of the dynamics."""
+        return _compiled(compared, self.dynamics)
 
-        def compare(state: jax.Array, measured: jax.Array) -> tuple[jax.Array, jax.Array]:
-            return self.dynamics.difference(measured[None], state[None])[0], self.dynamics.basis(state[None])[0]
 
-        return jax.jit(compare)
+def predicted(dynamics: Coordinated, state: jax.Array, control: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the state (L, 13) after a step under a control (J, 3), and the changes (n / 2,) of the rates."""
+    following = dynamics.rollout(state[None], control[None, None])[:, 0]
+    before, after = (rates_of(dynamics, states) for states in (state[None], following))
+    return following[0], (after - before)[0]
+
+
+def compared(dynamics: Coordinated, state: jax.Array, measured: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return the coordinates (n,) of a measured state (L, 13) from a state, and the basis (L, 13, n) of the latter."""
+    return dynamics.difference(measured[None], state[None])[0], dynamics.basis(state[None])[0]
+
+
+def _compiled(function: Callable[..., Any], dynamics: Coordinated) -> Callable[..., Any]:
+    """Return a function of dynamics compiled, for all dynamics of the same structure at once."""
+    function, arguments = program_of(function, dynamics)
+    return partial(jax.jit(function), *arguments)
 
 
 Measured = tuple[np.ndarray, np.ndarray, np.ndarray]

@@ -17,9 +17,9 @@ from larp_model.errors import InputError
 from larp_model.runtime import one_blas_thread, prepare_compiler
 from mpc.batch import SharedRollouts
 from mpc.cost import CostTerm, require_weight
-from mpc.dynamics import Dynamics, linearizable, of_steps
+from mpc.dynamics import Dynamics, linearizable, of_steps, program_of
 from mpc.feedback import Feedback, FeedbackInfo, LinearQuadratic, finite_part, riccati
-from mpc.problem import Equations, Inputs, PlannerProblem, Programs, Rollouts, filled_up, program_of
+from mpc.problem import Equations, Inputs, PlannerProblem, Programs, Rollouts, filled_up
 from mpc.search import COLOUR, Optimizer, Search, coloured_noise
 from mpc.spline import Interpolation, shift
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +13,7 @@ import numpy as np
 
 from larp_model.runtime import no_garbage_collection
 from mpc.cost import CostTerm, curvatures, evaluate, residuals, weighted_cost
-from mpc.dynamics import Continued, Dynamics, Linearizable, continued, of_steps, side_by_side
+from mpc.dynamics import Continued, Dynamics, Linearizable, continued, of_steps, program_of, side_by_side
 from mpc.feedback import LinearQuadratic, linear_quadratic
 from mpc.search import Evaluations, Residuals
 from mpc.spline import Interpolation, interpolate
@@ -288,12 +287,3 @@ class PlannerProblem:
         key = knots[best].tobytes()
         self.record.best[key], self.cache[key] = np.asarray(states)[best].copy(), evaluations.row(best)
         return evaluations
-
-
-def program_of(function: Callable[..., Any], dynamics: Dynamics) -> tuple[Callable[..., Any], tuple[Dynamics, ...]]:
-    """Return the function to compile of one whose first argument are dynamics, and its leading arguments.
-
-    Dynamics that are a pytree of arrays are an argument: others of the same structure then need not be compiled again.
-    """
-    traced = all(isinstance(leaf, jax.Array | np.ndarray) for leaf in jax.tree.leaves(dynamics))
-    return (function, (dynamics,)) if traced else (partial(function, dynamics), ())

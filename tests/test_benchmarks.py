@@ -9,12 +9,14 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from rich.table import Table
 
 from larp_model.errors import InputError
 from mpc import CEM
 from tasks.benchmarks import compilation, kick, realtime, report
+from tasks.kick import Kick
 from tasks.presets import PRESETS, Preset
 
 
@@ -149,6 +151,20 @@ def test_the_benchmark_of_real_time_delays_the_same_kicks_and_counts_missed_dead
     settings = realtime.RealtimeSettings(1, 0, ("0",), ("fast",), ("mujoco",), (), 4, ("perfect",), ("none",), 0.0)
     columns = realtime.table_of(points, settings).columns
     assert all(column.header for column in columns) and [*columns[2].cells] == ["0 ms", "40 ms"]
+
+
+def test_kicks_of_varied_humans_in_real_time_are_those_of_different_humans_and_expect_the_same_delays() -> None:
+    settings = realtime.RealtimeSettings(
+        2, 0, ("measured",), ("fast",), ("larp",), (), 4, ("lab",), ("filter",), 1.0, bodies="varied"
+    )
+    assert settings.name == "realtime_lab_rolling_1_bodies_varied" and settings.command.endswith("--bodies varied")
+    usual = realtime.Sessions(settings, Kick.standard())
+    (point,) = settings.points()
+    usual.times[point.dynamics, point.preset, point.interval] = [0.03]
+    tall = usual.of_human(1.1 * np.asarray(usual.kick.scene.morphology))
+    assert tall.seconds(point) == [0.03]
+    assert tall.kick.scene.morphology[0, 0] > 1.05 * usual.kick.scene.morphology[0, 0]
+    assert tall.kick.substeps == usual.kick.substeps
 
 
 @pytest.mark.parametrize("delay", ["-1", "soon", "nan", "inf"])

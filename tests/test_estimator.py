@@ -308,6 +308,25 @@ def test_a_ball_that_rests_does_not_bounce_in_the_estimate(lab: sensing.Sensing,
     assert np.abs(velocities).max() < 0.02
 
 
+def test_filters_of_the_same_scene_share_what_is_compiled(
+    scene: Scene, lab: sensing.Sensing, reference: Reference
+) -> None:
+    events, count = list[str](), 2 * Coordinates(scene).count
+
+    def listen(event: str, duration_secs: float, **details: str | int) -> None:
+        events.append(event)
+
+    for dynamics in (lab.dynamics, Simulator.of_physics(scene)):
+        own = KalmanFilter(dynamics, scene.dt, np.zeros(count))
+        start = own.init(reference.states[5], np.full(count, 1e-4), 0.0)
+        measured = Observation(reference.states[6], np.full(count, 1e-4))
+        events.clear()
+        own.update(start, measured, np.zeros((len(scene.motors), 3)), scene.dt)
+        jax.monitoring.register_event_duration_secs_listener(listen)
+    jax.monitoring.unregister_event_duration_listener(listen)
+    assert not events
+
+
 def test_where_all_measurements_are_lost_the_estimate_is_a_prediction_and_says_so(
     scene: Scene, lab: sensing.Sensing, reference: Reference
 ) -> None:

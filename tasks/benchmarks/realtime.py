@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -20,6 +20,7 @@ from mpc.realtime import PacedWorld, PlanningThread, SimulatedLatency
 from tasks.benchmarks import report
 from tasks.benchmarks.estimation import EstimateErrors, errors_table, estimate_errors, mean_errors
 from tasks.command import prepare_jax, run
+from tasks.episodes.people import random_people
 from tasks.kick import USUAL, Kick
 from tasks.models import DynamicsName
 from tasks.presets import PresetName, preset_of
@@ -48,6 +49,7 @@ class RealtimeSettings:
     sensors: tuple[SensorName, ...]
     estimator: tuple[EstimatorName, ...]
     rolling: float
+    bodies: Literal["usual", "varied"] = "usual"
 
     def check(self) -> None:
         """Raise InputError if a setting is invalid."""
@@ -76,7 +78,16 @@ class RealtimeSettings:
         parts.append(f"--sensors {' '.join(self.sensors)} --estimator {' '.join(self.estimator)}")
         if self.rolling:
             parts.append(f"--rolling {self.rolling:g}")
+        if self.bodies != "usual":
+            parts.append(f"--bodies {self.bodies}")
         return " ".join(parts)
+
+    @property
+    def name(self) -> str:
+        """Return the name of the run's JSON and of its part of RESULTS.md."""
+        rolling = f"rolling_{self.rolling:g}".replace(".", "_") if self.rolling else ""
+        parts = "realtime", *self.sensors, rolling, f"bodies_{self.bodies}" if self.bodies != "usual" else ""
+        return "_".join(part for part in parts if part)
 
     def points(self) -> list[RealtimePoint]:
         """Return the points to measure, each once."""
@@ -137,14 +148,20 @@ def delay_text(delay: str) -> str:
 
 
 class Sessions:
-    """Sessions of the kick, planners of points and times that their plans take, each made when first needed."""
+    """Sessions of a kick, planners of points and times that their plans take, each made when first needed."""
 
-    def __init__(self, settings: RealtimeSettings) -> None:
+    def __init__(self, settings: RealtimeSettings, kick: Kick) -> None:
         """Begin with none."""
-        self.settings, self.kick = settings, Kick.standard()
+        self.settings, self.kick = settings, kick
         self._sessions: dict[str, Session] = {}
-        self._seconds: dict[tuple[str, str, int], list[float]] = {}
+        self.times: dict[tuple[str, str, int], list[float]] = {}
         self._sensing: dict[tuple[str, str], Sensing] = {}
+
+    def of_human(self, sizes: np.ndarray) -> Sessions:
+        """Return those of another human, of these sizes (L, 3), whose plans are expected to take as long."""
+        other = Sessions(self.settings, Kick.of(self.kick.scene.sized(sizes), substeps=self.kick.substeps))
+        other.times = self.times
+        return other
 
     def session(self, dynamics: DynamicsName) -> Session:
         """Return the session of a model."""
@@ -167,12 +184,12 @@ class Sessions:
     def seconds(self, point: RealtimePoint) -> list[float]:
         """Return the times [s] that the plans of a kick took, after another kick that compiled all programs."""
         key = point.dynamics, point.preset, point.interval
-        if key not in self._seconds:
+        if key not in self.times:
             for _ in range(2):
                 latency = SimulatedLatency(self.kick.scene.dt)
                 self.session(point.dynamics).execute(self.planners(point), np.array(USUAL), 0, latency=latency)
-            self._seconds[key] = latency.seconds
-        return self._seconds[key]
+            self.times[key] = latency.seconds
+        return self.times[key]
 
     def timing(self, point: RealtimePoint, seed: int) -> tuple[Latency, World]:
         """Return the latency of a point's plans, and the world for it."""
@@ -304,6 +321,7 @@ def main(
     sensors: tuple[SensorName, ...] = ("perfect",),
     estimator: tuple[EstimatorName, ...] = ("filter",),
     rolling: float = 0.0,
+    bodies: Literal["usual", "varied"] = "usual",
     json: Path | None = None,
     publish: bool = False,
 ) -> None:
@@ -322,13 +340,15 @@ def main(
             encoders, an inertial unit, contact switches and a camera.
         estimator: of the state: none, which takes the last measurement, or filter.
         rolling: greatest speed [m/s] of a ball that comes from ahead or from the kicking side; 0: it rests.
+        bodies: varied: every kick is another human's, of any size.
         json: where the figures go; the picture goes beside them.
         publish: put the table into RESULTS.md.
     """
-    settings = RealtimeSettings(targets, seed, delay, preset, dynamics, interval, substeps, sensors, estimator, rolling)
+    settings = RealtimeSettings(
+        targets, seed, delay, preset, dynamics, interval, substeps, sensors, estimator, rolling, bodies
+    )
     settings.check()
-    name = f"realtime_{'_'.join(sensors)}" + (f"_rolling_{rolling:g}".replace(".", "_") if rolling else "")
-    json = json or Path(f"runs/benchmarks/{name}.json")
+    json = json or Path(f"runs/benchmarks/{settings.name}.json")
     report.ready(json, publish)
     prepare_jax()
     points = settings.points()
@@ -345,26 +365,29 @@ def main(
     table = table_of(figures, settings)
     report.show(table)
     if publish:
-        report.publish(name, f"Real time, {targets} targets", settings.command, table)
+        report.publish(settings.name, f"Real time, {targets} targets", settings.command, table)
     errors = {point.name: value["estimate"] for point, value in figures.items() if value["estimate"]}
     if errors:
         report.show(estimates := errors_table(errors))
         if publish:
-            report.publish(f"{name}_estimates", "What was known of the state", settings.command, estimates)
+            report.publish(f"{settings.name}_estimates", "What was known of the state", settings.command, estimates)
 
 
 def jobs_of(settings: RealtimeSettings, points: list[RealtimePoint]) -> dict[str, Callable[[], report.Row]]:
     """Return the jobs that execute one kick each, by name: the same kicks at every point."""
-    sessions, random = Sessions(settings), np.random.default_rng(settings.seed)
+    usual, random = Sessions(settings, Kick.standard()), np.random.default_rng(settings.seed)
+    people = random_people(np.random.default_rng((settings.seed, 1)), usual.kick.scene, settings.targets)
     kicks = []
     for _ in range(settings.targets):
         target, shift = random_kick(random)
         kicks.append((target, shift, random_roll(random, settings.rolling) if settings.rolling else np.zeros(2)))
-    return {
-        f"{point.name}: kick {index}": partial(kick_row, sessions, point, index, *one)
-        for point in points
-        for index, one in enumerate(kicks)
-    }
+
+    def one(point: RealtimePoint, index: int) -> report.Row:
+        sessions = usual if settings.bodies == "usual" else usual.of_human(people[index])
+        return kick_row(sessions, point, index, *kicks[index])
+
+    names = {f"{point.name}: kick {index}": (point, index) for point in points for index in range(settings.targets)}
+    return {name: partial(one, *job) for name, job in names.items()}
 
 
 if __name__ == "__main__":
