@@ -33,9 +33,9 @@ class Request:
 
 @dataclass(eq=False)
 class SharedRollouts:
-    """Rollouts of plans that are made side by side, so many of them at first."""
+    """Rollouts of plans that are made side by side. running: plans that neither wait for rows nor are made."""
 
-    running: int
+    running: int = 0
     waiting: list[Request] = field(default_factory=list)
     _turn: threading.Condition = field(default_factory=threading.Condition)
 
@@ -43,6 +43,7 @@ class SharedRollouts:
         """Return the results of jobs, which call `roll_out`; raises the first one's error, once all have ended."""
         results: dict[int, Result] = {}
         errors: dict[int, BaseException] = {}
+        self.running = len(jobs)
 
         def run(number: int) -> None:
             with self._turn:
@@ -94,16 +95,16 @@ class SharedRollouts:
 
 def answer(requests: Sequence[Request]) -> None:
     """Give requests with the same key their results."""
-    size = requests[0].size
-    ends = np.cumsum([len(request.rows.knots) for request in requests])
+    size, counts = requests[0].size, [len(request.rows.knots) for request in requests]
+    total, begins = sum(counts), np.cumsum([0, *counts[:-1]])
     all_rows = Rows(*(np.concatenate(leaves) for leaves in zip(*(request.rows for request in requests), strict=True)))
     # On a CPU wider programs are not faster; elsewhere there are at most log2 of the number of plans.
-    chunk = size if jax.default_backend() == "cpu" else size << (-(-int(ends[-1]) // size) - 1).bit_length()
+    chunk = size if jax.default_backend() == "cpu" else size << (-(-total // size) - 1).bit_length()
     parts = list[Any]()
-    for begin in range(0, int(ends[-1]), chunk):
-        rows = np.minimum(np.arange(begin, begin + chunk), int(ends[-1]) - 1)
+    for begin in range(0, total, chunk):
+        rows = np.minimum(np.arange(begin, begin + chunk), total - 1)
         parts.append(requests[0].roll_out(Rows(*(leaf[rows] for leaf in all_rows))))
     results = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    for request, end in zip(requests, ends.tolist(), strict=True):
-        rows = np.minimum(np.arange(end - len(request.rows.knots), end - len(request.rows.knots) + size), end - 1)
+    for request, begin, count in zip(requests, begins, counts, strict=True):
+        rows = begin + np.minimum(np.arange(size), count - 1)
         request.result = jax.tree.map(lambda leaf, rows=rows: leaf[rows], results)

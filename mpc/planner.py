@@ -177,7 +177,7 @@ class Planner:
             raise InputError(f"states: got {counts}, needs P plans, (P, L, 13), P windows")
         if len(steps := {window.steps for window in windows}) > 1:
             raise InputError(f"windows: got steps {sorted(steps, key=str)}, needs equally many in all windows")
-        together = SharedRollouts(len(plans))
+        together = SharedRollouts()
         jobs = [
             partial(self._step, *arguments, together.roll_out) for arguments in zip(plans, states, windows, strict=True)
         ]
