@@ -38,7 +38,7 @@ class ModelErrors:
 
 # A place that is measured slightly in the ground, or above it, makes the model lift what is there, or drop it: changes
 # of velocities are uncertain by a share.
-STEP, CHANGE_ERROR = ModelErrors((0.0, 0.0, 0.003, 0.03), (0.0, 0.0, 0.0003, 0.1)), 0.03
+STEP, CHANGE_ERROR = ModelErrors((0.0, 0.0, 0.003, 0.03), (0.0, 0.0, 0.0003, 0.1)), 0.1
 UNIFORM = ModelErrors((0.0, 0.0, 0.0, 0.01), (0.0, 0.0, 0.0003, 0.1))
 START = ModelErrors((0.01, 0.02, 0.03, 0.1), (0.1, 1.0, 1.0, 10.0))
 
