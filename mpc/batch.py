@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Hashable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -41,41 +42,31 @@ class SharedRollouts:
 
     def make(self, jobs: Sequence[Callable[[], Result]]) -> list[Result]:
         """Return the results of jobs, which call `roll_out`; raises the first one's error, once all have ended."""
-        results: dict[int, Result] = {}
-        errors: dict[int, BaseException] = {}
         self.running = len(jobs)
 
-        def run(number: int) -> None:
+        def run(job: Callable[[], Result]) -> Result:
             with self._turn:
                 try:
-                    results[number] = jobs[number]()
-                except BaseException as error:
-                    errors[number] = error
+                    return job()
                 finally:
                     self.running -= 1
-                    self._answer()
+                    self._go_on()
 
-        threads = [threading.Thread(target=run, args=(number,), name=f"plan {number}") for number in range(len(jobs))]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        for number in sorted(errors):
-            raise errors[number]
-        return [results[number] for number in range(len(jobs))]
+        with ThreadPoolExecutor(max(1, len(jobs)), "plan") as threads:
+            return list(threads.map(run, jobs))
 
     def roll_out(self, key: Hashable, roll_out: RollOut, rows: Rows, size: int) -> Any:
         """Return results as `problem.Rollouts` do, once every job waits for them or has ended; called by a job."""
         request = Request(key, roll_out, rows, size)
         self.waiting.append(request)
         self.running -= 1
-        self._answer()
+        self._go_on()
         self._turn.wait_for(lambda: request.result is not None or request.error is not None)
         if request.error is not None:
             raise request.error
         return request.result
 
-    def _answer(self) -> None:
+    def _go_on(self) -> None:
         """Roll out what plans wait for, if all of them wait."""
         if self.running or not self.waiting:
             return
@@ -85,7 +76,7 @@ class SharedRollouts:
             by_key.setdefault(request.key, []).append(request)
         for together in by_key.values():
             try:
-                answer(together)
+                roll_out_together(together)
             except BaseException as error:
                 for request in together:
                     request.error = error
@@ -93,7 +84,7 @@ class SharedRollouts:
         self._turn.notify_all()
 
 
-def answer(requests: Sequence[Request]) -> None:
+def roll_out_together(requests: Sequence[Request]) -> None:
     """Give requests with the same key their results."""
     size, counts = requests[0].size, [len(request.rows.knots) for request in requests]
     total, begins = sum(counts), np.cumsum([0, *counts[:-1]])

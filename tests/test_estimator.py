@@ -316,14 +316,18 @@ def test_filters_of_the_same_scene_share_what_is_compiled(
     def listen(event: str, duration_secs: float, **details: str | int) -> None:
         events.append(event)
 
-    for dynamics in (lab.dynamics, Simulator.of_physics(scene)):
+    def update(dynamics: Simulator) -> None:
         own = KalmanFilter(dynamics, scene.dt, np.zeros(count))
         start = own.init(reference.states[5], np.full(count, 1e-4), 0.0)
         measured = Observation(reference.states[6], np.full(count, 1e-4))
-        events.clear()
         own.update(start, measured, np.zeros((len(scene.motors), 3)), scene.dt)
-        jax.monitoring.register_event_duration_secs_listener(listen)
-    jax.monitoring.unregister_event_duration_listener(listen)
+
+    update(lab.dynamics)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        update(Simulator.of_physics(scene))
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
     assert not events
 
 
