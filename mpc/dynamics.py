@@ -160,14 +160,18 @@ class Continued:
 
 def linearizable(dynamics: Dynamics) -> TypeGuard[Linearizable | Continued]:
     """Return whether the steps under control have derivatives, as feedback needs."""
-    return isinstance(dynamics.dynamics if isinstance(dynamics, Continued) else dynamics, Linearizable)
+    return isinstance(of_steps(dynamics), Linearizable)
 
 
-def of_steps(dynamics: Linearizable | Continued) -> Linearizable:
+def of_steps(dynamics: Dynamics) -> Dynamics:
     """Return the dynamics of the steps under control."""
-    steps = dynamics.dynamics if isinstance(dynamics, Continued) else dynamics
-    assert isinstance(steps, Linearizable)
-    return steps
+    return dynamics.dynamics if isinstance(dynamics, Continued) else dynamics
+
+
+def advanced(dynamics: Dynamics, states: jax.Array, controls: jax.Array) -> jax.Array:
+    """Return the states (N, L, 13) after one step under controls (N, J, 3) [rad]."""
+    following: jax.Array = of_steps(dynamics).rollout(states, controls[:, None])[:, 0]
+    return following
 
 
 def continued(dynamics: Dynamics, states: jax.Array) -> jax.Array:

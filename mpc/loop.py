@@ -1,13 +1,14 @@
 """The closed loop in a world: plan, execute, shift. It records and draws nothing.
 
 A world waits for each plan, or goes on meanwhile (`realtime`): a plan then begins in the step in which it is expected,
-from the state that the planner's model predicts for it, and the plan before is executed until then.
+from the state that the planner's model predicts for it, and the plans before are executed until then.
 """
 
 from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol
@@ -17,7 +18,7 @@ import numpy as np
 
 from larp_model import state as packed
 from larp_model.errors import InputError
-from mpc.feedback import Feedback, FeedbackInfo, finite_part
+from mpc.feedback import Feedback, FeedbackInfo
 from mpc.planner import Plan, PlanInfo, Planner, Window
 
 
@@ -202,30 +203,24 @@ def target_of(plan: ActivePlan | None, phase: Phase, step: int, state: np.ndarra
 
 
 def predicted_state(
-    planner: Planner, phase: Phase, active: ActivePlan | None, step: int, lead: int, state: np.ndarray
+    planner: Planner, phase: Phase, plans: Sequence[ActivePlan], step: int, lead: int, state: np.ndarray
 ) -> np.ndarray:
-    """Return the state (L, 13) that a planner of a phase predicts `lead` steps on, under the targets sent until then.
+    """Return the state (L, 13) that a planner of a phase predicts `lead` steps on, from a state in a step.
 
-    Targets that answer deviations are those along a first prediction, without feedback. Where the model diverges, its
+    plans: that are executed until then, each from its own step on; they stay as they are. Where the model diverges, its
     last finite state is returned.
     """
-    if not lead:
-        return state
-
-    def targets(states: np.ndarray, plan: ActivePlan | None) -> np.ndarray:
-        return np.stack([target_of(plan, phase, step + number, states[number]) for number in range(lead)])
-
-    def rolled_out(controls: np.ndarray) -> np.ndarray:
-        states = np.repeat(state[None], lead + 1, axis=0)
-        states[1:, phase.links] = planner.roll_out(state[phase.links], controls, phase.window(step))
-        return states
-
-    without_feedback = None if active is None else replace(active, feedback=None)
-    states = rolled_out(targets(np.repeat(state[None], lead, axis=0), without_feedback))
-    if active is not None and active.feedback is not None and np.isfinite(states).all():
-        states = rolled_out(targets(states[:-1], replace(active)))
-    last: np.ndarray = finite_part(states)[-1]
-    return last
+    active, upcoming = None, deque(replace(plan) for plan in plans)
+    for number in range(step, step + lead):
+        while upcoming and upcoming[0].step <= number:
+            active = upcoming.popleft()
+        control = target_of(active, phase, number, state)
+        following = state.copy()
+        following[phase.links] = planner.advance(state[phase.links], control)
+        if not np.isfinite(following).all():
+            break
+        state = following
+    return state
 
 
 Sense = Callable[[int, np.ndarray, np.ndarray | None], np.ndarray]
@@ -237,7 +232,7 @@ class _Loop:
     """The state of an execution between its steps.
 
     phase: the number of the current one; end_step: in which it ends, if that is known. last: the phase's last plan,
-    that the next one continues. active: the plan that is executed. upcoming: a plan that begins in a later step.
+    that the next one continues. active: the plan that is executed. upcoming: plans that begin in later steps.
     """
 
     phases: Sequence[Phase]
@@ -247,7 +242,7 @@ class _Loop:
     end_step: int | None = None
     last: ActivePlan | None = None
     active: ActivePlan | None = None
-    upcoming: PlanResult | None = None
+    upcoming: deque[PlanResult] = field(default_factory=deque)
     in_flight: bool = False
     first_valid: int = 0  # plans of earlier phases are outdated
 
@@ -261,7 +256,8 @@ class _Loop:
                 break
             following = self.phases[self.phase + 1 : self.phase + 2]
             if following and following[0].first is not current.replan:
-                self.last, self.upcoming, self.first_valid = None, None, self.phase + 1
+                self.last, self.first_valid = None, self.phase + 1
+                self.upcoming.clear()
             self.phase, self.end_step = self.phase + 1, None
 
     def update(self, step: int, state: np.ndarray) -> list[PlanRecord]:
@@ -272,21 +268,22 @@ class _Loop:
 
     def request(self, step: int, state: np.ndarray) -> None:
         """Request the next plan in a step, if it is due."""
-        if self.phase >= len(self.phases) or self.in_flight or self.upcoming is not None:
+        if self.phase >= len(self.phases) or self.in_flight:
             return
-        phase, index = self.phases[self.phase], self.phase
+        phase, index, last = self.phases[self.phase], self.phase, self.last
         # Nothing is executed yet, and the world waits for the first plan.
         latency: Latency = NoLatency() if self.active is None else self.latency
-        lead, last = min(latency.lead, phase.replan.horizon - 1), self.last
+        lead = min(latency.lead, phase.replan.horizon - 1)
         due = last is None or (self.end_step is None and step + lead - last.step >= phase.interval)
         if not due:
             return
-        active = None if self.active is None else replace(self.active)
+        active = [] if self.active is None else [self.active]
+        plans = [replace(plan) for plan in (*active, *(plan for plan, _ in self.upcoming))]
 
         def job() -> PlanResult:
             planner, begin = phase.first if last is None else phase.replan, time.perf_counter()
             compiled_before = planner.compile_seconds
-            start = predicted_state(planner, phase, active, step, lead, state)
+            start = predicted_state(planner, phase, plans, step, lead, state)
             plan, record = next_plan(phase, index, step + lead, start, last, self.key)
             seconds = time.perf_counter() - begin - (planner.compile_seconds - compiled_before)
             return plan, record._replace(requested=step, seconds=seconds)
@@ -294,17 +291,24 @@ class _Loop:
         latency.submit(step, job)
         self.in_flight = True
         if latency is not self.latency:
-            self.in_flight, self.upcoming = False, latency.result(step)
+            self.expect(latency.result(step))
+
+    def expect(self, result: PlanResult | None) -> None:
+        """Take a plan that was in flight, None: it is not finished; that of a phase that is over is dropped."""
+        if result is None:
+            return
+        self.in_flight = False
+        if result[1].phase >= self.first_valid:
+            self.upcoming.append(result)
+            self.last = result[0]
 
     def receive(self, step: int, state: np.ndarray) -> PlanRecord | None:
         """Return the record of the plan that begins to be executed in a step, if there is one."""
-        if self.in_flight and (result := self.latency.result(step)) is not None:
-            self.in_flight = False
-            self.upcoming = result if result[1].phase >= self.first_valid else None
-        if self.upcoming is None or self.upcoming[1].step > step:
+        if self.in_flight:
+            self.expect(self.latency.result(step))
+        if not self.upcoming or self.upcoming[0][1].step > step:
             return None
-        (plan, record), self.upcoming = self.upcoming, None
-        self.last = self.active = plan
+        self.active, record = self.upcoming.popleft()
         record = record._replace(received=step)
         if step > record.step:
             return record

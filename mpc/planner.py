@@ -17,7 +17,7 @@ from larp_model.errors import InputError
 from larp_model.runtime import one_blas_thread, prepare_compiler
 from mpc.batch import SharedRollouts
 from mpc.cost import CostTerm, require_weight
-from mpc.dynamics import Dynamics, linearizable, of_steps, program_of
+from mpc.dynamics import Dynamics, Linearizable, advanced, of_steps, program_of
 from mpc.feedback import Feedback, FeedbackInfo, LinearQuadratic, finite_part, riccati
 from mpc.problem import Equations, Inputs, PlannerProblem, Programs, Rollouts, filled_up
 from mpc.search import COLOUR, Optimizer, Search, coloured_noise
@@ -242,20 +242,12 @@ class Planner:
         controls: jax.Array = _controls(self._equations, plan.knots, self._reference(reference))
         return controls
 
-    def roll_out(self, state: ArrayLike, controls: np.ndarray, window: Window) -> np.ndarray:
-        """Return the states (S, L, 13) after each of S <= H joint targets (S, J, 3) [rad], from a state (L, 13) on.
-
-        window: one that plans are made for; its context costs nothing here, but its shapes choose the program.
-        """
-        count = len(controls)
-        if not 1 <= count <= self.horizon:
-            raise InputError(f"controls: got {count}, needs 1 to horizon ({self.horizon})")
-        reference = np.concatenate([controls, np.repeat(controls[-1:], self.horizon - count, axis=0)])
-        steps = None if window.steps is None else count
-        inputs = self._inputs(state, window._replace(reference=reference, steps=steps))
-        knots = np.zeros((len(self.knot_times), *self.scale.shape), np.float32)
-        problem = PlannerProblem(self._equations, self._programs, inputs, knots)
-        return problem.for_display(knots[None])[1][0, :count]
+    def advance(self, state: ArrayLike, control: ArrayLike) -> np.ndarray:
+        """Return the state (L, 13) after a step under joint targets (J, 3) [rad], from a state (L, 13) on."""
+        function, arguments = program_of(advanced, self.dynamics)
+        arrays = (np.asarray(array, np.float32)[None] for array in (state, control))
+        following: np.ndarray = np.asarray(self._programs("advance", function, *arguments, *arrays))[0]
+        return following
 
     def predicted(self, info: PlanInfo, state: ArrayLike, window: Window) -> np.ndarray:
         """Return the states (S + 1, L, 13) of a plan made in `state` for a window, from there on, under control."""
@@ -266,7 +258,8 @@ class Planner:
 
         There is none from where the dynamics diverge, or where their derivatives are not finite.
         """
-        if not linearizable(self.dynamics):
+        steps = of_steps(self.dynamics)
+        if not isinstance(steps, Linearizable):
             raise InputError(f"dynamics: got {type(self.dynamics).__name__}, needs `linearize` for feedback")
         inputs, states = self._inputs(state, window), self.predicted(info, state, window)
         begin, compiled_before = time.perf_counter(), self._programs.seconds
@@ -283,7 +276,7 @@ class Planner:
         else:
             gains, states = np.zeros((len(problem.by_control), 0, 0)), states[:1]
         feedback = Feedback(
-            of_steps(self.dynamics),
+            steps,
             np.asarray(self.controls(plan, window.reference)),
             states,
             gains,

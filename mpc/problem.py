@@ -118,7 +118,9 @@ class Equations:
 
         controls = self.controls(knots, inputs.reference)
         curvature = curvatures(self.terms, residuals_of(states[1:], controls), inputs.weights)
-        problem = linear_quadratic(of_steps(dynamics), residuals_of, curvature, states, controls)
+        steps = of_steps(dynamics)
+        assert isinstance(steps, Linearizable)
+        problem = linear_quadratic(steps, residuals_of, curvature, states, controls)
         if inputs.steps is None:
             return problem
         computed = (jnp.arange(len(controls)) < inputs.steps)[:, None, None]

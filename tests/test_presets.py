@@ -88,7 +88,7 @@ def test_any_field_of_a_preset_can_be_changed_by_its_name() -> None:
     [
         ("interval", "must be NAME=VALUE"),
         ("interval=often", "must be NAME=VALUE"),
-        ("interval=2.5", "what it changes is 8"),
+        ("interval=2.5", "what it changes is 4"),
         ("intervl=2", "did you mean 'interval'"),
         ("every=2", "every is called interval now"),
         ("again.0.rounds=3", "again is called replan now"),

@@ -101,17 +101,18 @@ def test_a_plan_starts_from_the_state_that_the_model_predicts_for_its_beginning(
 def test_where_the_model_diverges_a_plan_starts_from_its_last_finite_state() -> None:
     @dataclass(frozen=True)
     class Fragile(Slider):
-        """Lost from its second step on."""
+        """Lost once a link has moved by so much."""
 
         def rollout(self, state: jax.Array, controls: jax.Array, steps: jax.Array | None = None) -> jax.Array:
             states = super().rollout(state, controls, steps)
-            return states.at[:, 1:].set(jnp.nan)
+            return jnp.where(state[:, None, :1, :1] > 0.1, jnp.nan, states)
 
     terms = (CostTerm("miss", lambda states, controls, target: states[-1, 0, :3] - target),)
     planner = Planner(Fragile(), terms, HORIZON, 3, DT, np.full((1, 3), 0.1), GaussNewton(2, 9))
     execution = executed(SimulatedLatency(DT, 0.03), planner=planner)
     assert begins(execution)[:2] == [(0, 0, 0), (1, 4, 4)]
     assert all(np.isfinite(plan.state).all() for plan in execution.plans)
+    assert execution.states[4][0, 0] > 0.1 >= execution.plans[1].state[0, 0] - float(execution.controls[0][0, 0])
 
 
 def test_a_late_plan_is_joined_where_it_would_be_by_then_and_the_next_is_expected_later() -> None:
@@ -127,6 +128,15 @@ def test_a_late_plan_is_joined_where_it_would_be_by_then_and_the_next_is_expecte
     controls = planner.controls(late.plan, np.zeros((HORIZON, 1, 3)))
     np.testing.assert_array_equal(execution.controls[11:15], controls[3:7])
     assert np.isnan(late.error)
+
+
+def test_while_a_finished_plan_waits_for_its_beginning_the_next_is_made() -> None:
+    latency = SimulatedLatency(DT, 0.01)
+    latency._leads.add(3)  # so many steps are expected to pass, where all plans take 1
+    execution = executed(latency, 12, interval=1)
+    assert begins(execution)[:5] == [(0, 0, 0), (1, 4, 4), (2, 5, 5), (3, 6, 6), (4, 7, 7)]
+    for plan in execution.plans:
+        np.testing.assert_allclose(plan.state, execution.states[plan.step], atol=1e-6)
 
 
 @dataclass
@@ -156,7 +166,7 @@ def test_drawn_delays_are_repeated_with_their_seed() -> None:
 def test_a_thread_plans_while_the_world_keeps_to_the_clock() -> None:
     planner = planner_of()
     planner.compile(STATE, window(0))
-    planner.roll_out(STATE, np.zeros((1, 1, 3)), window(0))
+    planner.advance(STATE, np.zeros((1, 3)))
     world, steps = PacedWorld(SliderWorld(), DT), 60
     phase = Phase(planner, planner, 4, window)
     begin = time.monotonic()
