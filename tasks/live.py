@@ -361,7 +361,7 @@ class Live:
         if settings.delay == REAL_TIME:
             slow = f"slow: {self._slow_steps} of {len(execution.controls)} steps took longer than they last"
             notes.append(slow if self._keeps_time else "plans take too long for real time: the world waits")
-        show_figures(self.page.panel, execution, self.errors, dt, self.planners(settings).interval, notes)
+        show_figures(self.page.panel, execution, self.errors, dt, notes)
 
     def _handle_replay(self, request: str) -> None:
         """Save the last kick, open a saved one, or show it beside the one being played; `alone` hides it again."""

@@ -17,16 +17,14 @@ def show_figures(
     execution: Execution,
     errors: Iterable[tuple[float, float]],
     dt: float,
-    interval: int,
     notes: Sequence[str] = (),
 ) -> None:
     """Show the figures of an execution so far, and of kicks before, on the panel.
 
-    errors: miss in the ground truth and as the model expected [m], of each kick. dt: a step [s]. interval: steps from
-    one plan to the next. notes: more lines.
+    errors: miss in the ground truth and as the model expected [m], of each kick. dt: a step [s]. notes: more lines.
     """
     infos, misses = [plan.info for plan in plans_of(execution)], 100.0 * np.reshape([*errors], (-1, 2))
-    lines = [*plan_lines(execution, dt, interval), *notes, *miss_lines(misses)]
+    lines = [*plan_lines(execution, dt), *notes, *miss_lines(misses)]
     panel.figures("\n".join(f"- {line}" for line in lines))
     costs = {name: [1e3 * info.terms[name] for info in infos] for name in infos[0].terms}
     panel.plot("Cost of the plan, in thousandths", costs, "plan")
@@ -34,14 +32,14 @@ def show_figures(
         panel.plot("Missed by [cm]", dict(zip(("in MuJoCo", "expected"), misses.T.tolist(), strict=True)), "kick")
 
 
-def plan_lines(execution: Execution, dt: float, interval: int) -> list[str]:
+def plan_lines(execution: Execution, dt: float) -> list[str]:
     """Return lines on the plans of an execution; see `show_figures`."""
     plans = plans_of(execution)
     infos, timing = [plan.info for plan in plans], timing_figures(execution, dt)
     replan_ms = 1e3 * np.array([info.seconds for info in infos][1:] or [infos[0].seconds])
     lines = [
         f"plans: first {infos[0].seconds:.2f} s; again {np.quantile(replan_ms, 0.5):.0f} ms (p50), "
-        f"{np.quantile(replan_ms, 0.99):.0f} ms (p99), every {1e3 * dt * interval:.0f} ms"
+        f"{np.quantile(replan_ms, 0.99):.0f} ms (p99), {timing['replans_per_second']:.0f} a second"
     ]
     lines += [f"feedback: {plan.feedback.seconds:.2f} s, once" for plan in plans if plan.feedback is not None][:1]
     lost, tried = (sum(getattr(info, name) for info in infos) for name in ("finite", "candidates"))

@@ -117,10 +117,11 @@ def test_figures_count_the_replans_that_missed_their_deadline() -> None:
         PlanRecord(step, 0, np.zeros((1, 13)), Mock(), info, requested=requested, received=received, error=error)
         for step, requested, received, error in ((0, 0, 0, 0.0), (8, 4, 8, 0.002), (16, 12, 19, np.nan))
     ]
-    lines = plan_lines(Execution([], [], records), 0.01, 8)
+    lines = plan_lines(Execution([], [], records), 0.01)
+    assert lines[0].endswith("11 a second")
     assert "late: 1 of 2 replans" in lines
     assert "begun 40 ms after they are requested, from a prediction that is 2.0 mm off" in lines
-    assert not any("late" in line for line in plan_lines(Execution([], [], records[:1]), 0.01, 8))
+    assert not any("late" in line for line in plan_lines(Execution([], [], records[:1]), 0.01))
 
 
 def test_a_drag_is_a_change_and_requests_are_handed_on_in_order(page: LivePage) -> None:
