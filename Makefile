@@ -54,6 +54,7 @@ MODEL := $(RUN) tasks.benchmarks.model --sequences 256 --publish
 bench: $(READY)
 	$(RUN) tasks.benchmarks.speed --publish
 	$(RUN) tasks.benchmarks.compilation --publish
+	$(RUN) tasks.benchmarks.content --publish
 	$(RUN) tasks.benchmarks.tradeoff --publish
 	$(RUN) tasks.benchmarks.optimizers --publish
 	$(RUN) tasks.benchmarks.stability --publish

@@ -170,6 +170,7 @@ ORDER = [
     "tasks.benchmarks.replays",
     "tasks.benchmarks.speed",
     "tasks.benchmarks.compilation",
+    "tasks.benchmarks.content",
     "tasks.benchmarks.tradeoff",
     "tasks.benchmarks.optimizers",
     "tasks.benchmarks.promises",

@@ -6,6 +6,7 @@ import json
 import re
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +14,10 @@ import numpy as np
 import pytest
 from rich.table import Table
 
+from larp_model.engines.mujoco import Truth
 from larp_model.errors import InputError
 from mpc import CEM
-from tasks.benchmarks import compilation, kick, realtime, report
+from tasks.benchmarks import compilation, content, kick, realtime, report
 from tasks.kick import Kick
 from tasks.presets import PRESETS, Preset
 
@@ -187,6 +189,31 @@ def test_the_cost_of_compiling_counts_a_loops_body_once_and_measures_all() -> No
     assert 4 < row["operations"] < 50 < row["hlo"]
     assert min(row["trace_s"], row["xla_s"], row["run_ms"]) > 0.0
     assert row["memory_mb"] >= 1e-6 * 4 * 4 * 50, "reverse mode keeps a number of each step"
+
+
+def test_operations_are_counted_as_often_as_they_run_and_of_branches_the_larger() -> None:
+    def program(matrix: jax.Array) -> Any:
+        many = jax.lax.fori_loop(0, 10, lambda _, value: value @ value, matrix)
+        return jax.lax.cond(matrix[0, 0] > 0.0, lambda: jnp.sin(many), lambda: jnp.sin(many) + many.T)
+
+    matrix = jnp.eye(4)
+    counts = 10 * 2 * 4**3, 1, 2 * 4**2
+    assert sum(counts) <= content.arithmetic(jax.make_jaxpr(program)(matrix).jaxpr) <= sum(counts) + 20
+
+
+def test_a_content_is_simulated_with_a_row_for_each_of_the_batch_and_stays_finite_in_mujoco() -> None:
+    builds = content.courses(2)
+    for name in ("4 balls, in touch", "chain of 4 links", "two humans, paired, apart"):
+        scene, states, controls = builds[name]()
+        assert states.shape == (2, len(scene.links), 13) and controls.shape[::2] == (2, len(scene.motors))
+        after, ok = Truth(scene, 2, 5).rollout(states, controls[:, :10])
+        assert ok.all() and np.isfinite(after).all()
+
+
+def test_content_without_scenes_or_engine_steps_is_refused(tmp_path: Path) -> None:
+    for name, ask in (("batch", partial(content.main, batch=0)), ("substeps", partial(content.main, substeps=0))):
+        with pytest.raises(InputError, match=f"{name} is 0, but must be at least 1"):
+            ask(json=tmp_path / "content.json")
 
 
 def test_the_cost_of_compiling_nothing_is_refused(tmp_path: Path) -> None:

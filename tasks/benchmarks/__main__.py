@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 from tasks.benchmarks import (
     compilation,
+    content,
     gap,
     kick,
     model,
@@ -23,6 +24,7 @@ NAMED: dict[str, Callable[..., None]] = {
     "model": model.main,
     "speed": speed.main,
     "compilation": compilation.main,
+    "content": content.main,
     "tradeoff": tradeoff.main,
     "optimizers": optimizers.main,
     "gap": gap.main,
