@@ -207,10 +207,10 @@ def predicted_state(
 ) -> np.ndarray:
     """Return the state (L, 13) that a planner of a phase predicts `lead` steps on, from a state in a step.
 
-    plans: that are executed until then, each from its own step on; they stay as they are. Where the model diverges, its
-    last finite state is returned.
+    plans: that are executed until then, each from its own step on; their feedback goes on with the prediction. Where
+    the model diverges, its last finite state is returned.
     """
-    active, upcoming = None, deque(replace(plan) for plan in plans)
+    active, upcoming = None, deque(plans)
     for number in range(step, step + lead):
         while upcoming and upcoming[0].step <= number:
             active = upcoming.popleft()

@@ -245,7 +245,7 @@ class Planner:
     def advance(self, state: ArrayLike, control: ArrayLike) -> np.ndarray:
         """Return the state (L, 13) after a step under joint targets (J, 3) [rad], from a state (L, 13) on."""
         function, arguments = program_of(advanced, self.dynamics)
-        arrays = (np.asarray(array, np.float32)[None] for array in (state, control))
+        arrays = self._state(state)[None], np.asarray(control, np.float32)[None]
         following: np.ndarray = np.asarray(self._programs("advance", function, *arguments, *arrays))[0]
         return following
 
@@ -319,11 +319,6 @@ class Planner:
 
     def _inputs(self, state: ArrayLike, window: Window) -> Inputs:
         """Return the public arguments, checked, as arrays of fixed shape and type."""
-        state = np.asarray(state, np.float32)
-        if state.ndim != 2 or state.shape[1] != 13:
-            raise InputError(f"state: got shape {state.shape}, needs (L, 13)")
-        if not np.isfinite(state).all():
-            raise InputError("state: got numbers that are not finite, needs all of them finite")
         if window.steps is not None and not 1 <= window.steps <= self.horizon:
             raise InputError(f"window.steps: got {window.steps}, needs 1 to horizon ({self.horizon})")
         weights = {term.name: float(term.weight) for term in self.terms}
@@ -333,7 +328,15 @@ class Planner:
             require_weight(name, weight)
             weights[name] = float(weight)
         arrays = jax.tree.map(_array, (window.context, weights, window.steps))
-        return Inputs(state, self._reference(window.reference), *arrays)
+        return Inputs(self._state(state), self._reference(window.reference), *arrays)
+
+    def _state(self, state: ArrayLike) -> np.ndarray:
+        state = np.asarray(state, np.float32)
+        if state.ndim != 2 or state.shape[1] != 13:
+            raise InputError(f"state: got shape {state.shape}, needs (L, 13)")
+        if not np.isfinite(state).all():
+            raise InputError("state: got numbers that are not finite, needs all of them finite")
+        return state
 
     def _reference(self, reference: ArrayLike) -> ArrayLike:
         shape = (self.horizon, *self.scale.shape)

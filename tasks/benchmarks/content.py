@@ -26,11 +26,11 @@ from larp_model.simulator import Simulator
 from tasks.benchmarks import report
 from tasks.benchmarks.engines import (
     GRADIENT_STEPS,
-    OFFSETS,
     STEPS,
     Course,
     Question,
     course,
+    course_of,
     time_gradient,
     time_stepped,
     time_traced,
@@ -40,6 +40,7 @@ from tasks.motions.references import embedded
 
 # Distance of neighbours that are out of each other's reach [m].
 APART = 3.0
+RADIUS = ball().links[0].radius
 # Balls in a row; 16 with pairs of neighbours compile for minutes.
 BALLS, MANY = (1, 2, 4), 16
 # Operations that move numbers and compute none.
@@ -80,7 +81,7 @@ def at(body: Body, *places: tuple[float, float, float]) -> Occupant:
 
 def balls(count: int, distance: float) -> list[Occupant]:
     """Return balls on the ground in a row, their centres so far apart [m]."""
-    return [at(ball(f"ball{number}"), (distance * number, 0.0, 0.11)) for number in range(count)]
+    return [at(ball(f"ball{number}"), (distance * number, 0.0, RADIUS)) for number in range(count)]
 
 
 def person(detail: Detail, name: str = "human", aside: float = 0.0) -> Occupant:
@@ -104,29 +105,23 @@ def neighbours(occupants: list[Occupant]) -> tuple[Pair, ...]:
     )
 
 
-def course_of(occupants: list[Occupant], pairs: tuple[Pair, ...], batch: int) -> Course:
-    """Return the course of a scene of these bodies, each row with small offsets of joint targets of its own."""
-    scene = Scene(tuple(occupant.body for occupant in occupants), pairs)
-    state = np.concatenate([occupant.state for occupant in occupants])
-    controls = np.concatenate([occupant.controls for occupant in occupants], axis=1)
-    offsets = OFFSETS * np.random.default_rng(0).standard_normal((batch, 1, *controls.shape[1:]))
-    return Course(scene, np.broadcast_to(state, (batch, *state.shape)), (controls + offsets).astype(np.float32))
-
-
 def courses(batch: int) -> dict[str, Callable[[], Course]]:
     """Return what scenes contain, by name, and their courses."""
 
+    def together(occupants: list[Occupant], pairs: tuple[Pair, ...]) -> Course:
+        scene = Scene(tuple(occupant.body for occupant in occupants), pairs)
+        state = np.concatenate([occupant.state for occupant in occupants])
+        return course_of(scene, state, np.concatenate([occupant.controls for occupant in occupants], axis=1), batch)
+
     def of(occupants: Callable[[], list[Occupant]], paired: bool = False) -> Callable[[], Course]:
         def build() -> Course:
-            bodies = occupants()
-            return course_of(bodies, neighbours(bodies) if paired else (), batch)
+            present = occupants()
+            return together(present, neighbours(present) if paired else ())
 
         return build
 
     def legs_that_touch() -> Course:
-        scene = human_and_ball(self_contact=True).only("human")
-        one = person("lean")
-        return course_of([one], scene.within.pairs, batch)
+        return together([person("lean")], human_and_ball(self_contact=True).within.pairs)
 
     def with_ball(reach: str) -> Course:
         return course(Question("larp", "human_ball", reach, 1, batch))
@@ -137,7 +132,7 @@ def courses(batch: int) -> dict[str, Callable[[], Course]]:
     return {
         **{f"{count} balls, apart" if count > 1 else "ball": of(partial(balls, count, APART), True) for count in BALLS},
         f"{MANY} balls, apart, without pairs": of(partial(balls, MANY, APART)),
-        f"{BALLS[-1]} balls, in touch": of(partial(balls, BALLS[-1], 0.22), True),
+        f"{BALLS[-1]} balls, in touch": of(partial(balls, BALLS[-1], 2.0 * RADIUS), True),
         "chain of 4 links": of(lambda: [at(chain(), *hanging)]),
         "human, 13 links": of(lambda: [person("lean")]),
         "human, 13 links, whose legs can touch": legs_that_touch,

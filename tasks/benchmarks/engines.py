@@ -128,10 +128,13 @@ def course(question: Question) -> Course:
     if question.reach == "far":
         state[-1, 0] += AWAY
     targets = reference.controls[begin : begin + steps, motors.astype(int)]
-    random = np.random.default_rng(question.seed)
-    offsets = OFFSETS * random.standard_normal((question.batch, 1, len(motors), 3))
-    states = np.broadcast_to(state, (question.batch, *state.shape))
-    return Course(full_scene.only(*bodies), states, (targets + offsets).astype(np.float32))
+    return course_of(full_scene.only(*bodies), state, targets, question.batch, question.seed)
+
+
+def course_of(scene: Scene, state: np.ndarray, targets: np.ndarray, batch: int, seed: int = 0) -> Course:
+    """Return the course from a state (L, 13) under joint targets (T, J, 3) [rad], with small offsets in each row."""
+    offsets = OFFSETS * np.random.default_rng(seed).standard_normal((batch, 1, *targets.shape[1:]))
+    return Course(scene, np.broadcast_to(state, (batch, *state.shape)), (targets + offsets).astype(np.float32))
 
 
 class Traced(NamedTuple):
