@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,6 +37,15 @@ def plans_of(execution: Execution) -> list[PlanRecord]:
     return [plan for plan in execution.plans if plan.phase == 0]
 
 
+def last_plan(plans: Sequence[PlanRecord], contact: int | None) -> PlanRecord:
+    """Return the last plan that began before the ball was struck in a state of this number, if it was struck.
+
+    In a world that goes on, a plan that was requested before may begin only afterwards.
+    """
+    before = [plan for plan in plans if contact is None or plan.step < contact]
+    return (before or plans)[-1]
+
+
 def measured(contact: int | None, count: int) -> tuple[int, int]:
     """Return the range of `count` states in which the miss is measured: from first contact, if any, to 2 s after it."""
     return (0, count) if contact is None else (max(contact - 1, 0), min(contact + AFTER_CONTACT + 1, count))
@@ -47,7 +57,7 @@ def summary_of(task: Task, execution: Execution, goal: Any) -> dict[str, Any]:
     free = task.untouched(states[0], len(states) - 1)
     contact = strike_step(states, free)
     begin, end = measured(contact, len(states))
-    last = plans[-1]
+    last = last_plan(plans, contact)
     truth_error = task.missed(states[begin:end], begin, goal)
     model_error = task.missed(last.info.states, last.step + 1, goal)
     links = states[: begin + 1, task.human, packed.POSITION]
@@ -159,9 +169,15 @@ class Run:
         return plans_of(self.execution)
 
     @property
+    def last_plan(self) -> PlanRecord:
+        """Return the last plan before the ball was struck, whose prediction is compared with the ground truth."""
+        struck: float | None = self.summary["gap"]["contact_s"]["truth"]
+        return last_plan(self.plans, None if struck is None else round(struck / self.task.scene.dt))
+
+    @property
     def predicted(self) -> np.ndarray:
         """Return the states (T', L, 13) that the last plan predicted, from the state that it began in."""
-        last = self.plans[-1]
+        last = self.last_plan
         return np.concatenate([last.state[None], last.info.states])
 
     @property
@@ -190,7 +206,7 @@ class Run:
             states,
             task.marker(self.goal),
             self.predicted,
-            self.plans[-1].step,
+            self.last_plan.step,
             task.reference.states[: len(states)],
             task.title(self.goal),
             facts(task, self.summary),
@@ -219,7 +235,7 @@ class Run:
         """
         from viewer import kick_picture, write_html
 
-        folder, name, recording, last = Path(folder), self.task.name, self.recording, self.plans[-1]
+        folder, name, recording, last = Path(folder), self.task.name, self.recording, self.last_plan
         require_writable(folder, "folder")
         buffer = io.BytesIO()
         np.savez_compressed(

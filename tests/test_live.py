@@ -34,6 +34,7 @@ from tasks.live_choices import (
 )
 from tasks.live_figures import plan_lines
 from tasks.presets import PRESETS
+from tasks.run import last_plan
 from viewer import LivePage, PageClosedError, Push
 from viewer.camera import VIEWS, PictureCamera, View
 from viewer.handles import Handles
@@ -122,6 +123,12 @@ def test_figures_count_the_replans_that_missed_their_deadline() -> None:
     assert "late: 1 of 2 replans" in lines
     assert "begun 40 ms after they are requested, from a prediction that is 2.0 mm off" in lines
     assert not any("late" in line for line in plan_lines(Execution([], [], records[:1]), 0.01))
+
+
+def test_what_is_compared_with_the_kick_is_the_last_plan_that_began_before_it() -> None:
+    info = PlanInfo(1.0, {}, np.zeros((1, 1, 13)), [], np.zeros(0), 8, 8, 0, 0.02, 0.0)
+    plans = [PlanRecord(step, 0, np.zeros((1, 13)), Mock(), info) for step in (0, 20, 40)]
+    assert [last_plan(plans, contact).step for contact in (None, 41, 40, 20, 0)] == [40, 40, 20, 0, 40]
 
 
 def test_a_drag_is_a_change_and_requests_are_handed_on_in_order(page: LivePage) -> None:
