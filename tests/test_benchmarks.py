@@ -138,14 +138,14 @@ def test_the_benchmark_of_real_time_delays_the_same_kicks_and_counts_missed_dead
     search = (CEM(samples=8, rounds=1, elites=2),)
     monkeypatch.setitem(PRESETS, "fast", Preset(search, search, interval=10, recovery=search))
     realtime.main(targets=1, delay=("0", "40"), dynamics=("mujoco",), substeps=4)
-    content = json.loads(Path("runs/benchmarks/realtime_perfect.json").read_text())
+    content = json.loads(Path("runs/benchmarks/realtime_perfect_mujoco_substeps_4.json").read_text())
     instant, delayed = content["points"]
     assert instant["lead_ms"] == 0.0 and delayed["lead_ms"] == pytest.approx(40.0)
     assert instant["deadlines_missed"] == delayed["deadlines_missed"] == 0
     assert instant["prediction_error_m"] == 0.0 < delayed["prediction_error_m"] < 0.02
     one, other = content["rows"]
     assert one["target"] == other["target"] and one["truth_error_m"] != other["truth_error_m"]
-    assert Path("runs/benchmarks/realtime_perfect.png").is_file()
+    assert Path("runs/benchmarks/realtime_perfect_mujoco_substeps_4.png").is_file()
     points = {
         realtime.RealtimePoint(*(point[name] for name in realtime.RealtimePoint._fields)): point
         for point in content["points"]
@@ -159,7 +159,8 @@ def test_kicks_of_varied_humans_in_real_time_are_those_of_different_humans_and_e
     settings = realtime.RealtimeSettings(
         2, 0, ("measured",), ("fast",), ("larp",), (), 4, ("lab",), ("filter",), 1.0, bodies="varied"
     )
-    assert settings.name == "realtime_lab_rolling_1_bodies_varied" and settings.command.endswith("--bodies varied")
+    assert settings.name == "realtime_lab_rolling_1_bodies_varied_substeps_4"
+    assert settings.command.endswith("--bodies varied")
     usual = realtime.Sessions(settings, Kick.standard())
     (point,) = settings.points()
     usual.times[point.dynamics, point.preset, point.interval] = [0.03]

@@ -85,9 +85,20 @@ class RealtimeSettings:
     @property
     def name(self) -> str:
         """Return the name of the run's JSON and of its part of RESULTS.md."""
-        rolling = f"rolling_{self.rolling:g}".replace(".", "_") if self.rolling else ""
-        parts = "realtime", *self.sensors, rolling, f"bodies_{self.bodies}" if self.bodies != "usual" else ""
-        return "_".join(part for part in parts if part)
+        parts = ["realtime", *self.sensors]
+        if self.rolling:
+            parts.append(f"rolling_{self.rolling:g}".replace(".", "_"))
+        if self.bodies != "usual":
+            parts.append(f"bodies_{self.bodies}")
+        if self.preset != ("fast",):
+            parts += self.preset
+        if self.dynamics != ("larp",):
+            parts += self.dynamics
+        if self.substeps != SUBSTEPS:
+            parts.append(f"substeps_{self.substeps}")
+        if self.interval:
+            parts.append("rates")
+        return "_".join(parts)
 
     def points(self) -> list[RealtimePoint]:
         """Return the points to measure, each once."""
