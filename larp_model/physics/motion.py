@@ -143,11 +143,13 @@ def _stage(body: Body, constants: Constants, inputs: BodyInputs, start: StageSta
     parents = body.parents
     orientation = rotated(links.orientation, start.rotation_vector)
     end_matrices = rotation_matrices(rotated(orientation, h * angular_velocity))
+    matrices = rotation_matrices(orientation)
     inertia = inertias(body, end_matrices, sizes)
     momentum, mass = mv(inertia.angular, angular_velocity), sizes[:, 2:3]
-    momenta = Momenta(momentum + h * (torques - cross(angular_velocity, momentum)), mass * (velocity + h * gravity))
+    turning = precessing(body, matrices, sizes, angular_velocity, h)
+    gyroscopic = cross(turning, mv(inertia.angular, turning))
+    momenta = Momenta(momentum + h * (torques - gyroscopic), mass * (velocity + h * gravity))
     anchors = turned_anchors(links.local_anchors, end_matrices, np.arange(1, len(body.links)), parents)
-    matrices = rotation_matrices(orientation)
     impulse, resistance = servos(body, orientation, matrices, targets, angular_velocity, h, scale)
     height = links.position[:, 2:] + start.rise
     anchors, impulse, resistance = barrier((anchors, impulse, resistance))
@@ -161,6 +163,19 @@ def _stage(body: Body, constants: Constants, inputs: BodyInputs, start: StageSta
     ground_inertia, _ = problem.linear(motion)
     total_inertia = jax.tree.map(jnp.add, inertia, ground_inertia)
     return StageEnd(motion.velocity, motion.angular_velocity, total_inertia, anchors)
+
+
+def precessing(body: Body, matrices: Array, sizes: Array, angular_velocity: Array, h: Array | float) -> Array:
+    """Return the angular velocities (n, 3, B) [rad/s] of links after `h` [s] in which nothing acts on them.
+
+    A capsule is a symmetric top, which precesses about its angular momentum. Gyroscopic torques at the start of a stage
+    would add energy to it, those at its end do not. matrices: (n, 3, 3, B), of the orientations.
+    """
+    along, across = moments(sizes[:, 0], sizes[:, 1], sizes[:, 2])
+    axes = np.array([link.axis for link in body.links], np.float32)
+    axis = mv(matrices, jnp.asarray(axes, matrices.dtype)[..., None])
+    share = ((along - across) / across)[:, None] * dot(axis, angular_velocity)
+    return angular_velocity + h * share * cross(axis, angular_velocity)
 
 
 def velocity_products(body: Body, anchors: Anchors, angular_velocity: Array) -> tuple[Array, Array]:
