@@ -5,6 +5,7 @@ After M. Andriluka et al., "Learned neural physics simulation for articulated 3D
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -31,6 +32,8 @@ from larp_model.sharding import shared
 
 # Of its result, a rollout holds so many at a time.
 COPIES = 3
+# Scenes are moved towards the origin by whole multiples of this [m]: near it, no number changes.
+TILE = 16.0
 
 
 def step(
@@ -109,7 +112,7 @@ class Simulator:
 
         torques: external, (N, H, L, 3) [N m]. morphology (N or 1, L, 3); the scene's by default. steps (): so many of
         the H are computed, the rest repeat the last; all by default. All are taken in the state's precision, 32
-        or 64 bits. Positions in 32 bits are 0.1 mm apart 1 km from the origin: plan near it.
+        or 64 bits. Positions in 32 bits are 0.1 mm apart 1 km from the origin, and 1 mm apart at 10 km.
         """
         arguments = self._checked(state, controls, torques, morphology, np.shape(controls)[1:2])
         start, targets, *_ = arguments
@@ -189,6 +192,19 @@ def _array(name: str, value: ArrayLike, dtype: DTypeLike | None = None) -> Array
         raise InputError(f"{name} is of type {type(value).__name__}, but needs an array of numbers") from None
 
 
+def near_origin(function: Callable[..., Array], model: Model, weights: Weights, state: Array, *arguments: Any) -> Array:
+    """Return the states of `step` or `rollout`, computed with the first link of each scene within `TILE` of the origin.
+
+    Numbers are precise there. Models that are not invariant compute where the scene is.
+    """
+    if not model.invariant:
+        return function(model, weights, state, *arguments)
+    tiles = TILE * jnp.round(state[:, 0, :2] / TILE)
+    offset = jnp.zeros((len(state), packed.SIZE), state.dtype).at[:, :2].set(tiles)
+    after = function(model, weights, state - offset[:, None], *arguments)
+    return after + offset.reshape(-1, *(1,) * (after.ndim - 2), packed.SIZE)
+
+
 def rollout(
     model: Model, weights: Weights, state: Array, controls: Array, torques: Array | None = None,
     morphology: Array | None = None, steps: Array | None = None, stop_gradient: bool = False,
@@ -218,12 +234,12 @@ def rollout(
 # Compiled once for each shape where they are called by themselves; inlined where JAX traces their caller.
 @partial(jax.jit, static_argnums=0, inline=True)
 def _step(model: Model, weights: Weights, *arrays: Any) -> Array:
-    return shared(partial(step, model), *_by_row(weights, *arrays))
+    return shared(partial(near_origin, step, model), *_by_row(weights, *arrays))
 
 
 @partial(jax.jit, static_argnums=0, inline=True)
 def _rollout(model: Model, weights: Weights, *arrays: Any) -> Array:
-    return shared(partial(rollout, model), *_by_row(weights, *arrays))
+    return shared(partial(near_origin, rollout, model), *_by_row(weights, *arrays))
 
 
 @partial(jax.jit, static_argnums=0, inline=True)

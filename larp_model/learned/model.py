@@ -22,7 +22,10 @@ class Model(Protocol):
 
     @property
     def invariant(self) -> bool:
-        """Return whether the model is equivariant under turns about z; else training augments its data."""
+        """Return whether shifts along the ground and turns about z shift and turn what it returns.
+
+        Else training augments its data.
+        """
 
     @property
     def side_by_side(self) -> int:
