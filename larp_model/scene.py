@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from larp_model.errors import InputError
@@ -107,6 +108,10 @@ class Joint:
         _check("joint", "damping", self.damping, 0.0, strict=False)
 
 
+# Of a critically damped spring.
+LEAST_RESTITUTION = math.exp(-2.0)
+
+
 @dataclass(frozen=True)
 class Surface:
     """The contact law of two bodies: a damped spring on their penetration r, r'' = -stiffness r - damping r'.
@@ -125,12 +130,25 @@ class Surface:
 
     @staticmethod
     def bouncing(contact_time: float, restitution: float, friction: float) -> Surface:
-        """Return the surface whose free impact lasts `contact_time` [s] and restores `restitution` of the speed."""
+        """Return the surface whose free impact lasts `contact_time` [s] and restores `restitution` of the speed.
+
+        An impact ends where the damped spring no longer pushes (T. Schwager and T. Pöschel, Granular Matter 9 (2007),
+        "Coefficient of restitution and linear-dashpot model revisited").
+        """
         _check("surface", "contact_time", contact_time, 0.0, strict=True)
-        if not 0.0 < restitution <= 1.0:
-            raise InputError(f"surface.restitution is {restitution!r}, but must be in (0, 1]")
-        decay = -math.log(restitution) / contact_time
-        frequency = math.pi / contact_time
+        if not LEAST_RESTITUTION < restitution <= 1.0:
+            raise InputError(
+                f"surface.restitution is {restitution!r}, but must be in ({LEAST_RESTITUTION:.3g}, 1]: with less, the "
+                "spring does not swing"
+            )
+
+        def phase(ratio: float) -> float:
+            return math.pi - 2.0 * math.atan(ratio)
+
+        # Ratio of the spring's decay [1/s] to its angular frequency [rad/s].
+        ratio = brentq(lambda ratio: ratio * phase(ratio) + math.log(restitution), 0.0, 1e4, xtol=1e-12)
+        frequency = phase(ratio) / contact_time
+        decay = ratio * frequency
         return Surface(frequency**2 + decay**2, 2.0 * decay, friction)
 
 
