@@ -178,6 +178,7 @@ ORDER = [
     "tasks.benchmarks.stress",
     "tasks.benchmarks.random_scenes",
     "tasks.benchmarks.gradients",
+    "tasks.benchmarks.laws",
     "tasks.benchmarks.stability",
     "tasks.benchmarks.page",
     "tasks.benchmarks.pose",

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 
 from larp_model import state as packed
-from larp_model.bodies import ball
+from larp_model.bodies import ball, capsule
 from larp_model.engines.mujoco import Truth
 from larp_model.errors import InputError
 from larp_model.learned.model import Model
 from larp_model.networks import Weights
-from larp_model.scene import Scene
+from larp_model.scene import Scene, Surface
 from larp_model.simulator import Simulator
 from mpc import CEM, Gradient, Window
 from mpc.loop import DivergenceError, Phase, execute
-from tasks.benchmarks import gradients, promises, random_scenes, stability, stress
+from tasks.benchmarks import gradients, laws, promises, random_scenes, stability, stress
 from tasks.motions.references import Reference
 
 
@@ -61,6 +61,44 @@ def test_a_prediction_is_flagged_from_where_it_diverges_and_no_other_row_with_it
     after = np.asarray(ball_model.rollout(jnp.asarray(states), jnp.zeros((3, 4, 0, 3))))
     assert np.isfinite(after[[0, 2]]).all()
     assert np.isnan(after[1]).all()
+
+
+def test_a_ball_moves_alike_wherever_it_is(ball_model: Simulator) -> None:
+    near = np.repeat(lying_ball(), 2, axis=0)
+    near[:, 0, packed.VELOCITY] = 3.0, 1.0, -4.0
+    far = near.copy()
+    far[0, 0, :2] += 16_000.0, -1_600.0
+    controls = jnp.zeros((2, 60, 0, 3))
+    moved = np.asarray(ball_model.rollout(far, controls), float)
+    moved[0, :, 0, :2] -= 16_000.0, -1_600.0
+    # 1 mm is the distance of neighbouring numbers at 16 km.
+    np.testing.assert_allclose(moved[0], moved[1], atol=1e-3)
+
+
+def test_a_capsule_that_tumbles_keeps_its_energy_and_its_angular_momentum() -> None:
+    scene = Scene((capsule(),), gravity=0.0)
+    for rate in (1.0, 3.0):
+        starts = laws.turning(laws.straight(capsule()), rate)
+        after = Simulator.of_physics(scene).rollout(starts.astype(np.float32), np.zeros((len(starts), 200, 0, 3)))
+        before, now = laws.mechanics(scene, starts), laws.mechanics(scene, np.asarray(after[:, -1], float))
+        np.testing.assert_allclose(now.energy, before.energy, rtol=laws.ENERGY)
+        apart = np.linalg.norm(now.angular_momentum - before.angular_momentum, axis=-1)
+        assert (apart <= laws.MOMENTUM * np.linalg.norm(before.angular_momentum, axis=-1)).all()
+
+
+def test_a_surface_restores_what_it_says_as_mujocos_does() -> None:
+    for restitution in (0.6, 0.9):
+        ours, engines = laws.rebounds(Surface.bouncing(0.02, restitution, 0.5), 5.0)
+        np.testing.assert_allclose(ours, engines, atol=1e-3)
+        assert ours.mean() == pytest.approx(restitution, rel=0.01)
+
+
+def test_a_ball_with_spin_gains_no_energy_on_the_ground() -> None:
+    assert all(row["held"] for row in laws.spinning_balls())
+
+
+def test_the_derivative_of_a_bounce_is_its_slope_over_all_moments_of_contact() -> None:
+    assert all(row["held"] for row in laws.bounce_slopes())
 
 
 @pytest.mark.parametrize(

