@@ -179,6 +179,7 @@ ORDER = [
     "tasks.benchmarks.random_scenes",
     "tasks.benchmarks.gradients",
     "tasks.benchmarks.laws",
+    "tasks.benchmarks.kick_plans",
     "tasks.benchmarks.stability",
     "tasks.benchmarks.page",
     "tasks.benchmarks.pose",

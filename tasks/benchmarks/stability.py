@@ -22,13 +22,12 @@ from larp_model.errors import InputError
 from larp_model.simulator import Simulator
 from mpc import CEM, MPPI, CostTerm, Dynamics, GaussNewton, Gradient, Planner, Window
 from mpc.loop import DivergenceError, Phase, execute
-from tasks.benchmarks import gradients, laws, random_scenes, report, stress, wild_states
+from tasks.benchmarks import gradients, kick_plans, laws, random_scenes, report, stress, wild_states
 from tasks.benchmarks.promises import Bench, refusal, row
 from tasks.benchmarks.report import Row
 from tasks.command import prepare_jax, run
 from tasks.kick import Kick
 from tasks.models import models_of
-from tasks.run import REACHABLE
 from tasks.task import check_target
 
 COLOURS = {True: "#0072b2", False: "#d55e00"}
@@ -182,38 +181,6 @@ def _refused_arguments() -> Iterator[Row]:
             yield row("planner", value, "refused by name", *refusal(call, words))
 
 
-def targets(bench: Bench, continued_model: Dynamics) -> list[Row]:
-    """Return rows of kick plans to targets, most of which no ball can reach."""
-    kick = bench.kick
-    planner = kick.planner(continued_model, (CEM(samples=16, rounds=2, elites=4),))
-    plan = planner.init(jax.random.key(0))
-    rows = []
-    ball = kick.start()[-1, :3]
-    for name, target, reachable in (
-        ("ahead", (4.0, 0.0, 0.5), None),
-        ("behind the human", (-4.0, 0.0, 0.5), False),
-        ("inside the human", tuple(kick.start()[0, :3]), False),
-        ("the ball's own place", tuple(ball), True),
-        ("below the ground", (4.0, 0.0, -2.0), False),
-        ("1 km away", (1e3, 0.0, 0.0), False),
-        ("1e6 m away", (1e6, 0.0, 0.0), False),
-        ("1e19 m away", (1e19, 0.0, 0.0), False),
-        ("1e30 m away", (1e30, 0.0, 0.0), False),
-    ):
-        window = kick.window(np.array(target))(0)
-        after, info = planner.step(plan, kick.start(), window)
-        with np.errstate(all="ignore"):
-            miss = kick.missed(info.states, 1, np.array(target)) if np.isfinite(target).all() else np.inf
-        whole_plan = bool(np.isfinite(after.knots).all())
-        honest = np.isfinite(info.cost) == (info.finite > 0)
-        right = reachable is None or (miss <= REACHABLE) == reachable
-        promise = "a finite plan, cost inf if no candidate is finite"
-        promise += "" if reachable is None else f", {'' if reachable else 'not '}within {REACHABLE:g} m of it"
-        observation = f"misses by {miss:.3g} m, cost {info.cost:.3g}, {info.finite} of {info.candidates} finite"
-        rows.append(row("target", name, promise, observation, whole_plan and honest and right))
-    return rows
-
-
 def execution(bench: Bench) -> list[Row]:
     """Return rows of plans that are executed in a world whose states do not stay finite."""
     kick = bench.kick
@@ -267,10 +234,13 @@ def caught(jobs: dict[str, Callable[[], list[Row]]]) -> dict[str, Callable[[], R
 # The report.
 
 
-def jobs_of(bench: Bench, continued_model: Dynamics, states: int, seed: int) -> dict[str, Callable[[], list[Row]]]:
+def jobs_of(
+    bench: Bench, continued_model: Dynamics, states: int, kicks: int, seed: int
+) -> dict[str, Callable[[], list[Row]]]:
     """Return the jobs of all cases but random scenes, by name.
 
     continued_model: the model of the scene that goes on with the ball alone. states: on which gradients are compared.
+    kicks: random ones to plan, of each kind.
     """
     jobs: dict[str, Callable[[], list[Row]]] = {
         f"{body} {field}": partial(wild_states.sizes, bench, body, field)
@@ -293,7 +263,12 @@ def jobs_of(bench: Bench, continued_model: Dynamics, states: int, seed: int) -> 
         "balls with spin": laws.spinning_balls,
         "slopes of a bounce": laws.bounce_slopes,
         "planners": small_planners,
-        "targets": partial(targets, bench, continued_model),
+        "targets": partial(kick_plans.targets, bench, continued_model),
+        **{
+            f"random kicks: {kind}": partial(kick_plans.random_kicks, bench, continued_model, kind, kicks, seed)
+            for kind in kick_plans.KINDS
+        },
+        "repeated plans": kick_plans.repeated_plans,
         "execution": partial(execution, bench),
         "gradients of steps": partial(gradients.of_steps, bench, states, seed),
         "slopes of a ball": partial(gradients.ball_slopes, bench),
@@ -349,6 +324,7 @@ def main(
     scenes: int = 250,
     seed: int = 0,
     states: int = 1000,
+    kicks: int = 100,
     json: Path = Path("runs/benchmarks/stability.json"),
     weights: Path | None = None,
     publish: bool = False,
@@ -359,6 +335,7 @@ def main(
         scenes: random scenes, each in 20 random states.
         seed: of scenes, states and directions.
         states: on which gradients are compared.
+        kicks: random ones to plan, of each of ten kinds.
         json: where the rows go; the picture goes beside them.
         weights: manifest of weights that correct larp's physics; none by default.
         publish: put the table into RESULTS.md.
@@ -368,14 +345,16 @@ def main(
         raise InputError(f"scenes is {scenes}, but must be at least {kinds}, one of each kind")
     if states < 32:
         raise InputError(f"states is {states}, but must be at least 32")
+    if kicks < 1:
+        raise InputError(f"kicks is {kicks}, but must be at least 1")
     report.ready(json, publish, weights)
     prepare_jax()
     kick = Kick.standard()
     models = models_of(kick.scene, "larp", weights)
     assert models.simulator is not None
     bench = Bench(kick, models.simulator)
-    jobs = jobs_of(bench, models.scene, states, seed) | scene_jobs(bench, scenes, seed)
-    command = f"python -m tasks.benchmarks.stability --scenes {scenes} --seed {seed} --states {states}"
+    jobs = jobs_of(bench, models.scene, states, kicks, seed) | scene_jobs(bench, scenes, seed)
+    command = f"python -m tasks.benchmarks.stability --scenes {scenes} --seed {seed} --states {states} --kicks {kicks}"
     rows = [row for result in report.collect(json, command, caught(jobs)) for row in result["rows"]]
     held = sum(row["held"] for row in rows)
     content = {"command": command, "hardware": report.hardware(), "cases": len(rows), "held": held, "rows": rows}
