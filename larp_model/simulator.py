@@ -200,9 +200,9 @@ def near_origin(function: Callable[..., Array], model: Model, weights: Weights, 
     if not model.invariant:
         return function(model, weights, state, *arguments)
     tiles = TILE * jnp.round(state[:, 0, :2] / TILE)
-    offset = jnp.zeros((len(state), packed.SIZE), state.dtype).at[:, :2].set(tiles)
+    offset = jnp.zeros_like(state[:, 0]).at[:, :2].set(tiles)
     after = function(model, weights, state - offset[:, None], *arguments)
-    return after + offset.reshape(-1, *(1,) * (after.ndim - 2), packed.SIZE)
+    return after + jnp.expand_dims(offset, range(1, after.ndim - 1))
 
 
 def rollout(

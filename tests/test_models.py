@@ -25,6 +25,7 @@ from larp_model.physics.kinematics import kinematics, morphology_of
 from larp_model.physics.motion import BodyMotion, Constants
 from larp_model.scene import Scene
 from larp_model.simulator import step
+from tasks.benchmarks.gradients import bounces
 from tasks.scenarios import scenario
 
 SOON = {"xla_backend_optimization_level": 0}
@@ -137,7 +138,7 @@ def test_turning_the_world_turns_a_step_of_what_says_so(case: Case) -> None:
 
 
 @pytest.mark.slow
-def test_forward_derivatives_of_a_step_are_those_of_differences(case: Case) -> None:
+def test_forward_derivatives_of_a_step_are_those_of_differences_but_for_bounces(case: Case) -> None:
     direction = np.random.default_rng(0).standard_normal(case.states.shape)
 
     def moved(states: Array) -> Array:
@@ -145,7 +146,11 @@ def test_forward_derivatives_of_a_step_are_those_of_differences(case: Case) -> N
 
     slope = jax.jit(lambda s, d: jax.jvp(moved, (s,), (d,))[1], compiler_options=SOON)(case.states, direction)
     ahead, behind = (case.after(case.states + side * direction) for side in (1e-7, -1e-7))
-    np.testing.assert_allclose((ahead - behind) / 2e-7, slope, atol=1e-4 * np.abs(slope).max())
+    differences, smooth = (ahead - behind) / 2e-7, np.ones(case.states.shape[:2], bool)
+    if case.model.scene.bodies[-1].is_ball:  # whose bounces have the slope of a mean: see `ball.timed`
+        smooth[:, -1] = ~bounces(case.model.scene, case.states, case.after(case.states))
+    assert smooth.mean() > 0.95
+    np.testing.assert_allclose(differences[smooth], slope[smooth], atol=1e-4 * np.abs(slope).max())
 
 
 def test_networks_change_what_physics_says(case: Case) -> None:

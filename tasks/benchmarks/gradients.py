@@ -87,7 +87,7 @@ def step_gradients(bench: Bench, states: np.ndarray, controls: np.ndarray, seed:
     return {
         "reverse": np.abs(reverse - paired) / np.abs(paired),
         "differences": np.stack(errors),
-        "bounces": _bounces(bench.kick.scene, states, after),
+        "bounces": bounces(bench.kick.scene, states, after),
     }
 
 
@@ -99,13 +99,13 @@ def converged(model: Simulator) -> Simulator:
     return replace(model, model=replace(model.model, constants=constants, contacts=contacts))
 
 
-def _bounces(scene: Scene, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return whether (N,) the ball moves up or down on the ground in the step between states (N, L, 13)."""
+def bounces(scene: Scene, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Return whether (N,) the last body, a ball, moves up or down on the ground in a step between states (N, L, 13)."""
     heights = np.stack([states[:, -1, 2] - scene.ball.links[0].radius for states in (before, after)])
     speeds = np.stack([states[:, -1, 9] for states in (before, after)])
     lowest = np.minimum(heights.min(axis=0), heights[0] + scene.dt * speeds[0])
-    bounces: np.ndarray = (lowest < 0.0) & (np.abs(speeds).max(axis=0) > 0.1 * RESTING)
-    return bounces
+    bounced: np.ndarray = (lowest < 0.0) & (np.abs(speeds).max(axis=0) > 0.1 * RESTING)
+    return bounced
 
 
 def of_steps(bench: Bench, count: int, seed: int) -> list[Row]:
