@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 
@@ -288,37 +289,50 @@ def table_of(figures: dict[RealtimePoint, dict[str, Any]], settings: RealtimeSet
 
 
 def picture(figures: dict[RealtimePoint, dict[str, Any]]) -> Figure:
-    """Plot misses over delay and over the rate of replans, a line for each planner."""
-    figure = Figure(figsize=(11, 4.5), layout="constrained")
-    over_delay, over_rate = figure.subplots(1, 2)
+    """Plot misses over delay and over the rate of replans, as far as they vary."""
+    delays, rates = ({getattr(point, name) for point in figures} for name in ("delay", "interval"))
+    draws = [draw for draw, values in ((_over_delay, delays), (_over_rate, rates)) if len(values) > 1] or [_over_delay]
+    figure = Figure(figsize=(5.5 * len(draws), 4.5), layout="constrained")
     highest = 100.0 * max(value["mean_truth_error_m"] for value in figures.values())
+    for draw, axes in zip(draws, figure.subplots(1, len(draws), squeeze=False)[0], strict=True):
+        draw(axes, figures)
+        axes.set(ylabel="miss in MuJoCo [cm]", ylim=(0.0, 1.25 * highest))
+        axes.grid(color="0.92")
+        axes.set_axisbelow(True)
+        axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def _over_delay(axes: Axes, figures: dict[RealtimePoint, dict[str, Any]]) -> None:
     for number, planner in enumerate(dict.fromkeys(point.planner for point in figures)):
         own = {point: value for point, value in figures.items() if point.planner == planner}
         misses = {point: 100.0 * value["mean_truth_error_m"] for point, value in own.items()}
         by_clock = [point for point in own if point.delay in (MEASURED, CLOCK)]
         fixed = sorted(own.keys() - set(by_clock), key=lambda point: float(point.delay))
         colour = f"C{number}"
-        over_delay.plot(
+        axes.plot(
             [float(point.delay) for point in fixed], [misses[point] for point in fixed], "o-", c=colour, label=planner
         )
         for point in by_clock:
             place = own[point]["lead_ms"], misses[point]
-            over_delay.plot(*place, "D", c=colour, label=None if fixed or point is not by_clock[0] else planner)
-            over_delay.annotate(point.delay, place, (6, 4), textcoords="offset points", fontsize=8)
-        rates = [value["replans_per_second"] for value in own.values()]
-        over_rate.scatter(rates, misses.values(), color=colour)
-    for name in dict.fromkeys(point.without_interval for point in figures):
-        own_values = [value for point, value in figures.items() if point.without_interval == name]
-        if len(own_values) > 1:
-            line = sorted((value["replans_per_second"], 100.0 * value["mean_truth_error_m"]) for value in own_values)
-            over_rate.plot(*zip(*line, strict=True), "-", c="0.6", zorder=0)
-            over_rate.annotate(name, line[-1], (0, 8), textcoords="offset points", fontsize=8, ha="right")
-    for axes, label in ((over_delay, "delay [ms]"), (over_rate, "replans a second")):
-        axes.set(xlabel=label, ylabel="mean miss in MuJoCo [cm]", ylim=(0.0, 1.25 * highest))
-        axes.grid(color="0.92")
-        axes.set_axisbelow(True)
-    over_delay.legend(frameon=False, fontsize=8, loc="upper left")
-    return figure
+            axes.plot(*place, "D", c=colour, label=None if fixed or point is not by_clock[0] else planner)
+            axes.annotate(point.delay, place, (6, 4), textcoords="offset points", fontsize=8)
+    axes.set(xlabel="delay [ms]")
+    axes.legend(frameon=False, fontsize=8, loc="upper left")
+
+
+def _over_rate(axes: Axes, figures: dict[RealtimePoint, dict[str, Any]]) -> None:
+    for number, name in enumerate(dict.fromkeys(point.without_interval for point in figures)):
+        own = [value for point, value in figures.items() if point.without_interval == name]
+        own.sort(key=lambda value: float(value["replans_per_second"]))
+        rates = [value["replans_per_second"] for value in own]
+        for which, style in (("mean", "o-"), ("median", "o:")):
+            misses = [100.0 * value[f"{which}_truth_error_m"] for value in own]
+            axes.plot(rates, misses, style, c=f"C{number}", label=f"{name}: {which}")
+    axes.set(xlabel="replans a second", xscale="log")
+    axes.set_xticks(ticks := (5, 10, 20, 50, 100), [*map(str, ticks)])
+    axes.minorticks_off()
+    axes.legend(frameon=False, fontsize=8, loc="upper left")
 
 
 def main(
