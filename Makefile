@@ -58,6 +58,7 @@ bench: $(READY)
 	$(RUN) tasks.benchmarks.tradeoff --publish
 	$(RUN) tasks.benchmarks.optimizers --publish
 	$(RUN) tasks.benchmarks.stability --publish
+	$(RUN) tasks.benchmarks.damaged_files --publish --files 100000
 	$(RUN) tasks.benchmarks.page --kicks 200 --publish
 	for scene in chains1 chains2 human_ball; do $(RUN) tasks.train --scene $$scene --design paper --effort 0.5 || exit; done
 	$(MODEL) --scene human_ball --seed 2 --beside paper

@@ -415,16 +415,17 @@ def load_recording(task: Task, folder: Path) -> Recording:
     """Return the recording of a saved kick. Raises InputError where it is of another scene, or damaged."""
     try:
         summary = json.loads((folder / "summary.json").read_text())
-        with np.load(folder / f"{task.name}.npz", allow_pickle=False) as file:
+        with (folder / f"{task.name}.npz").open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             states, predicted, plan_step = (file[name] for name in ("states", "predicted_states", "plan_step"))
-        target, lines, first = task.check(tuple(summary["target"])), facts(task, summary), states[int(plan_step)][None]
+        target, lines = task.check(tuple(summary["target"])), facts(task, summary)
+        expected = np.concatenate([states[int(plan_step)][None], predicted])
     except Exception as error:  # json, numpy and zipfile raise many kinds for a damaged file
         raise InputError(f"{folder.name} cannot be read: {type(error).__name__}: {error}") from None
     return Recording(
         task.scene,
         states,
         task.marker(target),
-        np.concatenate([first, predicted]),
+        expected,
         int(plan_step),
         task.reference.states[: len(states)],
         f"{task.title(target)} ({folder.name})",

@@ -179,6 +179,7 @@ ORDER = [
     "tasks.benchmarks.random_scenes",
     "tasks.benchmarks.gradients",
     "tasks.benchmarks.laws",
+    "tasks.benchmarks.damaged_files",
     "tasks.benchmarks.kick_plans",
     "tasks.benchmarks.stability",
     "tasks.benchmarks.page",

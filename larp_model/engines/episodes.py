@@ -103,7 +103,7 @@ def load(path: Path, scene: Scene) -> Episodes:
         raise InputError(f"episodes file {path} is of version {header.get('version')}, but {VERSION} is needed")
     links, motors = len(scene.links), len(scene.motors)
     steps = episodes.controls.shape[1] if episodes.controls.ndim == 4 else 0
-    count = len(episodes.states)
+    count = len(np.atleast_1d(episodes.states))
     expected = {
         "states": (count, steps + 1, links, packed.SIZE),
         "controls": (count, steps, motors, 3),

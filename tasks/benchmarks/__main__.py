@@ -5,6 +5,7 @@ from collections.abc import Callable
 from tasks.benchmarks import (
     compilation,
     content,
+    damaged_files,
     gap,
     kick,
     model,
@@ -30,6 +31,7 @@ NAMED: dict[str, Callable[..., None]] = {
     "gap": gap.main,
     "realtime": realtime.main,
     "stability": stability.main,
+    "damaged_files": damaged_files.main,
     "reference": reference.main,
     "page": page.main,
     "pose": pose.main,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import NamedTuple
-from zipfile import BadZipFile
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -38,9 +37,10 @@ def load(path: str | Path) -> Motion:
     path = Path(path)
     require_file("path", path)
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # numpy does not close the file itself if it is damaged.
+        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             arrays = dict(file)
-    except (ValueError, OSError, EOFError, BadZipFile):
+    except Exception:  # numpy and zipfile raise many kinds for a damaged file
         raise InputError(f"{path.name} is no npz file of numbers and names") from None
     if missing := [name for name in FIELDS if name not in arrays]:
         raise InputError(f"{path.name} has no {', '.join(missing)}: it needs {', '.join(FIELDS)}")
@@ -68,7 +68,10 @@ def motion(
     """
     body = human()
     names = [body.links[child].name for child, _, _ in body.motors]
-    rate, position, orientation, angles = (np.asarray(value, float) for value in (rate, position, orientation, angles))
+    rate, position, orientation, angles = (
+        _numbers(name, value)
+        for name, value in (("rate", rate), ("position", position), ("orientation", orientation), ("angles", angles))
+    )
     frames, count = len(position) if position.ndim else 0, len(names)
     for name, value, shape in (
         ("rate", rate, ()),
@@ -91,6 +94,14 @@ def motion(
         angles = angles[:, [joints.index(name) for name in names]]
     rotations = Rotation.from_quat(body.pose(orientation, angles).swapaxes(0, 1), scalar_first=True)
     return _motion_of_links(body, float(rate), position, rotations)
+
+
+def _numbers(name: str, value: object) -> np.ndarray:
+    try:
+        numbers = np.array(value)
+        return numbers.astype(float, casting="safe" if numbers.dtype.kind == "c" else "unsafe")
+    except (TypeError, ValueError):
+        raise InputError(f"{name} holds something that is not a number") from None
 
 
 def _joint_anchor(body: Body, point: Vector, link: int) -> np.ndarray:

@@ -9,15 +9,20 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from larp_model.bodies import human
+from larp_model.errors import InputError
 from larp_model.scene import Body
 from tasks.motions.details import in_detail
 
 FILE = Path(__file__).with_suffix(".json")
+# Axes of a joint as they are written, and numbers of each part of the initial state.
+AXES = ("0", "1", "2")
+START = {"lean": 2, "velocity": 3, "ball": 2}
 
 
 @dataclass(frozen=True)
@@ -48,11 +53,32 @@ class KeyPoses:
 
 
 def load(path: Path = FILE) -> KeyPoses:
-    """Read key poses from a JSON file in the form that `dumps` writes."""
-    content = json.loads(path.read_text())
-    angles = {(joint, int(axis)): tuple(row) for joint, axes in content["angles"].items() for axis, row in axes.items()}
-    start = {name: tuple(content[name]) for name in ("lean", "velocity", "ball")}
-    return KeyPoses(tuple(content["times"]), angles, **start)
+    """Read key poses from a JSON file in the form that `dumps` writes; raise InputError where it is another."""
+    joints = {link.name for link in human().links}
+    try:
+        content = json.loads(path.read_bytes())
+        times = _numbers(content["times"])
+        start: Any = {name: _numbers(content[name], size) for name, size in START.items()}
+        if len(times) < 2 or not (np.diff(times) > 0.0).all():
+            raise ValueError("times do not rise")
+        angles = {
+            (joint, AXES.index(axis)): _numbers(row, len(times))
+            for joint, axes in content["angles"].items()
+            for axis, row in axes.items()
+        }
+        if unknown := {joint for joint, _ in angles} - joints:
+            raise ValueError(f"there is no joint {unknown}")
+    except (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        raise InputError(f"key poses {path.name} cannot be read: {type(error).__name__}: {error}") from None
+    return KeyPoses(times, angles, **start)
+
+
+def _numbers(values: list[float], size: int | None = None) -> tuple[float, ...]:
+    """Return a list's numbers; raise ValueError where they are not finite, or not so many."""
+    numbers = tuple(map(float, values))
+    if not np.isfinite(numbers).all() or size not in (None, len(numbers)):
+        raise ValueError(f"a list does not hold {size or 'some'} finite numbers")
+    return numbers
 
 
 def dumps(poses: KeyPoses) -> str:

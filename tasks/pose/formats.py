@@ -325,7 +325,8 @@ def _checked_list(value: object) -> list[Any]:
 
 def _checked_numbers(what: str, value: object) -> np.ndarray:
     try:
-        return np.array(value, float)
+        numbers = np.array(value)
+        return numbers.astype(float, casting="safe" if numbers.dtype.kind == "c" else "unsafe")
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"has {what} with something that is not a number") from None
 
