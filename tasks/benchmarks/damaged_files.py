@@ -7,7 +7,6 @@ others.
 from __future__ import annotations
 
 import json
-import pickle
 import re
 import resource
 import time
@@ -121,8 +120,7 @@ def _write_kept_kick(folder: Path, kick: Kick) -> None:
 
 
 def _write_pickle(folder: Path) -> None:
-    content = {"keypoints2d": np.arange(30.0).reshape(5, 3, 2), "timestamps": np.arange(5), "names": ["a", "b"]}
-    (folder / "dance.pkl").write_bytes(pickle.dumps(content, protocol=4))
+    (folder / "dance.pkl").write_bytes(np.arange(600.0).reshape(100, 3, 2).dumps())
 
 
 def _copy(source: Path, folder: Path) -> None:
