@@ -39,6 +39,8 @@ SYNONYMS = {
 HANGING = ("upper_arm", "lower_arm", "thigh", "shin")
 # Least length of a link, in its radius: anchors along a link are in units of its length.
 ROUNDEST = 0.1
+# Largest distance of a link's ends from the origin [m].
+FARTHEST = 1000.0
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
@@ -140,6 +142,8 @@ def _geometry(
         radii.append(size[0])
     if not ends:
         raise InputError(f"source: {file}: {link!r} has no geom, but needs a capsule or a sphere")
+    if not (farthest := float(np.abs(ends).max() + max(radii))) <= FARTHEST:
+        raise InputError(f"source: {file}: {link!r} reaches to {farthest:.3g} m, but must be within {FARTHEST:g} m")
     return LinkGeometry(np.array(ends), np.array(radii), float(model.body_mass[rows].sum()))
 
 

@@ -102,6 +102,7 @@ def test_mujocos_own_humanoid_keeps_mass_bones_and_volume_and_stands() -> None:
         (('name="head"', 'name="skull"'), "has no body for 'head', but needs one; it has pelvis, torso, skull"),
         (('name="thigh_left"', 'name="upper_leg_right"'), "no body for 'left_thigh'"),
         (('<joint name="shin_left" type="ball"', '<joint name="shin_left" type="slide"'), "'shin_left' is a slide"),
+        (('<geom type="capsule"', '<geom size="1e9"/><geom type="capsule"'), r"'pelvis' reaches to 1e.09 m"),
         (('<geom type="capsule"', '<geom type="cylinder"'), "a geom of 'pelvis' is a cylinder, but must be a capsule"),
         (
             ("</worldbody>", '</worldbody><equality><joint joint1="a" joint2="b"/></equality>'),
