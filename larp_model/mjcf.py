@@ -69,6 +69,7 @@ def humanoid(source: str | Path, names: Mapping[str, str] | None = None, name: s
     path = Path(source)
     require_file("source", path)
     try:
+        path.read_bytes().decode()  # MuJoCo gives names back as such
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         raise InputError(
@@ -97,7 +98,8 @@ def _named(file: str, model: mujoco.MjModel, links: Sequence[str], names: dict[s
         candidates = [names[link]] if link in names else [body for body in bodies if usual_name(body) == link]
         if len(candidates) != 1 or candidates[0] not in bodies:
             number = "several bodies" if len(candidates) > 1 else "no body"
-            raise InputError(f"source: {file} has {number} for {link!r}, but needs one; it has {', '.join(bodies)}")
+            named = ", ".join(" ".join(body.split()) for body in bodies)
+            raise InputError(f"source: {file} has {number} for {link!r}, but needs one; it has {named}")
         body_of_link[link] = int(model.body(candidates[0]).id)
     return body_of_link
 

@@ -101,6 +101,7 @@ def test_mujocos_own_humanoid_keeps_mass_bones_and_volume_and_stands() -> None:
     [
         (('name="head"', 'name="skull"'), "has no body for 'head', but needs one; it has pelvis, torso, skull"),
         (('name="thigh_left"', 'name="upper_leg_right"'), "no body for 'left_thigh'"),
+        (('name="thigh_left"', 'name="a&#10;b"'), "no body for 'left_thigh', but needs one; it has .*a b"),
         (('<joint name="shin_left" type="ball"', '<joint name="shin_left" type="slide"'), "'shin_left' is a slide"),
         (('<geom type="capsule"', '<geom size="1e9"/><geom type="capsule"'), r"'pelvis' reaches to 1e.09 m"),
         (('<geom type="capsule"', '<geom type="cylinder"'), "a geom of 'pelvis' is a cylinder, but must be a capsule"),
@@ -145,3 +146,12 @@ def test_bodies_of_any_name_can_be_said_to_be_our_links(tmp_path: Path) -> None:
 )
 def test_names_of_bodies_are_understood(theirs: str, ours: str | None) -> None:
     assert usual_name(theirs) == ours
+
+
+def test_a_file_that_is_no_text_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "other.xml").write_bytes(
+        mjcf(human()).replace("head", "\N{LATIN SMALL LETTER E WITH ACUTE}").encode("latin1")
+    )
+    with pytest.raises(InputError, match=r"other\.xml is no MJCF file that MuJoCo reads: 'utf-8' codec") as caught:
+        humanoid(tmp_path / "other.xml")
+    assert "\n" not in str(caught.value)
