@@ -172,8 +172,7 @@ def precessing(body: Body, matrices: Array, sizes: Array, angular_velocity: Arra
     would add energy to it, those at its end do not. matrices: (n, 3, 3, B), of the orientations.
     """
     along, across = moments(sizes[:, 0], sizes[:, 1], sizes[:, 2])
-    axes = np.array([link.axis for link in body.links], np.float32)
-    axis = mv(matrices, jnp.asarray(axes, matrices.dtype)[..., None])
+    axis = axes_of(body, matrices)
     share = ((along - across) / across)[:, None] * dot(axis, angular_velocity)
     return angular_velocity + h * share * cross(axis, angular_velocity)
 
@@ -250,11 +249,16 @@ def moments(length: Array, radius: Array, mass: Array) -> tuple[Array, Array]:
     return along, across
 
 
+def axes_of(body: Body, matrices: Array) -> Array:
+    """Return the axes (n, 3, B) of the links' capsules in world axes, by rotations (n, 3, 3, B)."""
+    axes = np.array([link.axis for link in body.links], np.float32)
+    return mv(matrices, jnp.asarray(axes, matrices.dtype)[..., None])
+
+
 def inertias(body: Body, matrices: Array, sizes: Array) -> Inertia:
     """Return the inertias of the links alone, in world axes."""
     along, across = moments(sizes[:, 0], sizes[:, 1], sizes[:, 2])
-    axes = np.array([link.axis for link in body.links], np.float32)
-    axis = mv(matrices, jnp.asarray(axes, matrices.dtype)[..., None])
+    axis = axes_of(body, matrices)
     unit = jnp.eye(3, dtype=matrices.dtype)[..., None]
     angular = across[:, None, None] * unit + (along - across)[:, None, None] * outer(axis, axis)
     linear = jnp.broadcast_to(sizes[:, 2][:, None, None] * unit, angular.shape)

@@ -23,7 +23,7 @@ from tasks.models import models_of
 from tasks.presets import PRESETS
 from tasks.run import REACHABLE
 
-Task = tuple[np.ndarray, np.ndarray]
+StateAndTarget = tuple[np.ndarray, np.ndarray]
 """State (L, 13) and target (3,) [m] of a kick, of which numbers may be anything."""
 
 
@@ -59,34 +59,34 @@ def targets(bench: Bench, continued_model: Dynamics) -> list[Row]:
     return rows
 
 
-def _ahead(random: np.random.Generator, kick: Kick) -> Task:
+def _ahead(random: np.random.Generator, kick: Kick) -> StateAndTarget:
     bearing, distance = random.uniform(-0.6, 0.6), random.uniform(1.0, 6.0)
     return kick.start(), np.array([distance * np.cos(bearing), distance * np.sin(bearing), random.uniform(0.0, 1.5)])
 
 
-def _anywhere(random: np.random.Generator, kick: Kick) -> Task:
+def _anywhere(random: np.random.Generator, kick: Kick) -> StateAndTarget:
     return kick.start(), random.uniform((-10.0, -10.0, -1.0), (10.0, 10.0, 5.0))
 
 
-def _far(random: np.random.Generator, kick: Kick) -> Task:
+def _far(random: np.random.Generator, kick: Kick) -> StateAndTarget:
     direction = random.standard_normal(3)
     return kick.start(), 10.0 ** random.uniform(1.0, 30.0) * direction / np.linalg.norm(direction)
 
 
-def _inside(random: np.random.Generator, kick: Kick) -> Task:
+def _inside(random: np.random.Generator, kick: Kick) -> StateAndTarget:
     start = kick.start()
     return start, start[random.integers(len(start)), packed.POSITION] + random.uniform(-0.1, 0.1, 3)
 
 
-def _ball_elsewhere(random: np.random.Generator, kick: Kick) -> Task:
+def _ball_elsewhere(random: np.random.Generator, kick: Kick) -> StateAndTarget:
     return kick.start(random.uniform(-2.0, 2.0, 2)), USUAL
 
 
-def _ball_rolling(random: np.random.Generator, kick: Kick) -> Task:
+def _ball_rolling(random: np.random.Generator, kick: Kick) -> StateAndTarget:
     return kick.start(random.uniform(-0.2, 0.2, 2), random.uniform(-10.0, 10.0, 2)), USUAL
 
 
-def _ball_flying(random: np.random.Generator, kick: Kick) -> Task:
+def _ball_flying(random: np.random.Generator, kick: Kick) -> StateAndTarget:
     start = kick.start(random.uniform(-2.0, 2.0, 2))
     start[-1, 2] += random.uniform(0.0, 3.0)
     start[-1, packed.VELOCITY] = random.uniform(-30.0, 30.0, 3)
@@ -94,13 +94,13 @@ def _ball_flying(random: np.random.Generator, kick: Kick) -> Task:
     return start, USUAL
 
 
-def _human_pushed(random: np.random.Generator, kick: Kick) -> Task:
+def _human_pushed(random: np.random.Generator, kick: Kick) -> StateAndTarget:
     start = kick.start()
     start[kick.human, packed.VELOCITY] += random.uniform(-5.0, 5.0, 3)
     return start, USUAL
 
 
-def _human_turned(random: np.random.Generator, kick: Kick) -> Task:
+def _human_turned(random: np.random.Generator, kick: Kick) -> StateAndTarget:
     start, rows = kick.start(), kick.human
     turn = Rotation.random(rng=random)
     own = Rotation.from_quat(start[rows, packed.ORIENTATION], scalar_first=True)
@@ -110,7 +110,7 @@ def _human_turned(random: np.random.Generator, kick: Kick) -> Task:
     return start, USUAL
 
 
-def _no_numbers(random: np.random.Generator, kick: Kick) -> Task:
+def _no_numbers(random: np.random.Generator, kick: Kick) -> StateAndTarget:
     start, target = kick.start(), USUAL.copy()
     broken = random.choice([np.nan, np.inf, -np.inf, 1e39])
     if random.random() < 0.5:
@@ -121,7 +121,7 @@ def _no_numbers(random: np.random.Generator, kick: Kick) -> Task:
 
 
 # Random tasks, by kind.
-KINDS: dict[str, Callable[[np.random.Generator, Kick], Task]] = {
+KINDS: dict[str, Callable[[np.random.Generator, Kick], StateAndTarget]] = {
     "target ahead": _ahead,
     "target anywhere": _anywhere,
     "target at 10 to 1e30 m": _far,
