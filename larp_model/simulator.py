@@ -21,6 +21,7 @@ from larp_model import state as packed
 from larp_model import weights as stored
 from larp_model.bodies import usual
 from larp_model.errors import InputError
+from larp_model.expected_error import expected_errors
 from larp_model.learned.model import Model
 from larp_model.learned.residual import ResidualModel
 from larp_model.linearization import Coordinates, linearized
@@ -160,6 +161,11 @@ class Simulator:
         flat = _basis(self.scene, state.reshape(-1, *state.shape[-2:]), jnp.asarray(self.morphology, state.dtype))
         changes: Array = flat.reshape(*state.shape, -1)
         return changes
+
+    def expected_errors(self, states: ArrayLike) -> np.ndarray:
+        """Return errors (*, T) [m] to expect of steps between states (*, T + 1, L, 13): see `expected_error`."""
+        errors: np.ndarray = expected_errors(self.scene, np.asarray(states), np.asarray(self.morphology))
+        return errors
 
     def _checked(
         self, state: ArrayLike, control: ArrayLike, torque: ArrayLike | None, morphology: ArrayLike | None,

@@ -10,6 +10,7 @@ from typing import Any, Protocol, TypeGuard, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from larp_model.errors import InputError
 
@@ -58,6 +59,14 @@ class Linearizable(Coordinated, Protocol):
 
         d (n,): small deviations of states. v (3 J,): small changes of controls [rad].
         """
+
+
+@runtime_checkable
+class Calibrated(Dynamics, Protocol):
+    """Dynamics that know the size of their errors; `larp_model.Simulator` is one."""
+
+    def expected_errors(self, states: ArrayLike) -> np.ndarray:
+        """Return errors (*, T) [m] to expect of single steps between states (*, T + 1, L, 13): links, in the mean."""
 
 
 def side_by_side(dynamics: Dynamics) -> int:
@@ -166,6 +175,12 @@ def linearizable(dynamics: Dynamics) -> TypeGuard[Linearizable | Continued]:
 def of_steps(dynamics: Dynamics) -> Dynamics:
     """Return the dynamics of the steps under control."""
     return dynamics.dynamics if isinstance(dynamics, Continued) else dynamics
+
+
+def expected_errors(dynamics: Dynamics, states: np.ndarray) -> np.ndarray:
+    """Return errors (T,) [m] to expect of steps between states (T + 1, L, 13); none (0,) where nobody knows them."""
+    steps = of_steps(dynamics)
+    return steps.expected_errors(states) if isinstance(steps, Calibrated) else np.zeros(0)
 
 
 def advanced(dynamics: Dynamics, states: jax.Array, controls: jax.Array) -> jax.Array:

@@ -17,7 +17,7 @@ from larp_model.errors import InputError
 from larp_model.runtime import one_blas_thread, prepare_compiler
 from mpc.batch import SharedRollouts
 from mpc.cost import CostTerm, require_weight
-from mpc.dynamics import Dynamics, Linearizable, advanced, of_steps, program_of
+from mpc.dynamics import Dynamics, Linearizable, advanced, expected_errors, of_steps, program_of
 from mpc.feedback import Feedback, FeedbackInfo, LinearQuadratic, finite_part, riccati
 from mpc.problem import Equations, Inputs, PlannerProblem, Programs, Rollouts, filled_up
 from mpc.search import COLOUR, Optimizer, Search, coloured_noise
@@ -65,6 +65,7 @@ class PlanInfo(NamedTuple):
     finite: int  # candidates with a finite cost ...
     candidates: int  # ... of so many
     verified: int  # of them in other dynamics than the planner's own
+    expected_errors: np.ndarray  # (H,) m, of each step by the dynamics alone, mean over links; (0,) if not known
     seconds: float  # from arguments to finished results, compilation left out
     compile_seconds: float  # 0 unless this step had to compile
 
@@ -203,16 +204,17 @@ class Planner:
         states = problem.states_of(new_plan.knots)
         cost, terms = problem.plan_cost(new_plan.knots)
         compile_seconds = self._programs.seconds - compiled_before
-        record = problem.record
+        record, steps = problem.record, window.steps or self.horizon
         return new_plan, PlanInfo(
             cost=cost,
             terms=terms,
-            states=np.delete(states, np.s_[window.steps or self.horizon : self.horizon], axis=0),
+            states=np.delete(states, np.s_[steps : self.horizon], axis=0),
             costs=record.costs,
             elite_costs=search.costs,
             finite=sum(int(np.isfinite(costs).sum()) for costs in record.costs),
             candidates=sum(len(costs) for costs in record.costs),
             verified=record.verified,
+            expected_errors=expected_errors(self.dynamics, np.concatenate([inputs.state[None], states[:steps]])),
             seconds=time.perf_counter() - begin - compile_seconds,
             compile_seconds=compile_seconds,
         )

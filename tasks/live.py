@@ -26,7 +26,7 @@ from mpc.loop import DivergenceError, Execution
 from mpc.realtime import SimulatedLatency
 from tasks.live_choices import REAL_TIME, Choices, latency_of
 from tasks.live_figures import show_figures
-from tasks.run import REACHABLE, Run, facts, plans_of
+from tasks.run import REACHABLE, Run, described_errors, facts, plans_of
 from tasks.sensing import Perception, Sensing
 from tasks.sensors import PERFECT, SENSORS
 from tasks.session import Planners, Session
@@ -176,9 +176,13 @@ class Live:
         reach = "" if expected <= REACHABLE else " **Out of reach:** this plan comes nearest."
         expectation = f"The model expects to miss by {100.0 * expected:.1f} cm, planned in {info.seconds:.2f} s."
         controls = np.asarray(planner.controls(plan, window.reference))
-        self.page.show_message(
-            f"**Ready.** {expectation}{reach}\n\n{self._novelty_sentence(settings, state, info.states, controls)}"
-        )
+        errors = described_errors(info.expected_errors, 0.0, task.scene.dt)
+        lines = [
+            f"**Ready.** {expectation}{reach}",
+            f"Expected error of a step: {errors}." if errors else "",
+            self._novelty_sentence(settings, state, info.states, controls),
+        ]
+        self.page.show_message("\n\n".join(line for line in lines if line))
 
     def carry_out(self) -> None:
         """Plan and kick in the ground truth, then play the recording; each plan uses the current target and weights."""

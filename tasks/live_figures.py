@@ -28,6 +28,7 @@ def show_figures(
     panel.figures("\n".join(f"- {line}" for line in lines))
     costs = {name: [1e3 * info.terms[name] for info in infos] for name in infos[0].terms}
     panel.plot("Cost of the plan, in thousandths", costs, "plan")
+    panel.plot("Expected error of each step [mm]", {"last plan": (1e3 * infos[-1].expected_errors).tolist()}, "step")
     if len(misses) > 1:
         panel.plot("Missed by [cm]", dict(zip(("in MuJoCo", "expected"), misses.T.tolist(), strict=True)), "kick")
 

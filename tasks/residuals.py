@@ -9,7 +9,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from larp_model import expected_error as by_step
 from larp_model import state as packed
+from larp_model.scene import Scene
 
 
 @jax.tree_util.register_dataclass
@@ -51,3 +53,12 @@ def apart(states: Array, controls: Array, context: Any, link: int, other: int) -
 def upright(states: Array, controls: Array, context: Any) -> Array:
     """Return the depth of the pelvis, row 0, below the context's `pelvis_height` [m], (H, 1) [m]."""
     return jnp.maximum(context.pelvis_height - states[: len(controls), 0, 2:3], 0.0)
+
+
+def expected_errors(states: Array, controls: Array, context: Any, scene: Scene) -> Array:
+    """Return the errors of the model to expect in the steps from the second on, (H - 1, 1) [mm]; see `expected_error`.
+
+    As a cost, it keeps a plan where the model is to be trusted: without hard contacts and sudden motion.
+    """
+    errors: Array = by_step.expected_errors(scene, states[: len(controls)], jnp.asarray(scene.morphology))
+    return 1e3 * errors[:, None]

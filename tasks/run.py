@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 # Steps after contact up to which the miss and a fall are measured.
 AFTER_CONTACT = 200
+# Largest error of a step that is to be expected in usual kicks: on average 0.5 mm, at the strike, and up to 0.7 [m].
+USUAL_ERROR = 1e-3
 # A goal is reachable if a plan comes so near to it [m].
 REACHABLE = 0.25
 
@@ -75,6 +77,10 @@ def summary_of(task: Task, execution: Execution, goal: Any) -> dict[str, Any]:
         "ball_speed_m_s": float(np.linalg.norm(states[begin:end, task.ball, packed.VELOCITY], axis=-1).max()),
         "touched": contact is not None,
         "reachable": model_error <= REACHABLE,
+        "expected_errors": {
+            "begin_s": last.step * task.scene.dt,
+            "steps_m": [round(float(error), 7) for error in last.info.expected_errors],
+        },
         "gap": gap(task.scene, states, np.concatenate([last.state[None], last.info.states]), last.step, free),
         "reference_deviation_m": float(deviation.mean()),
         "fell": bool((states[:end, 0, 2] < 0.5 * task.standing_height).any()),
@@ -119,6 +125,17 @@ def replayed(task: Task, execution: Execution, goal: Any, substeps: int = FINE_S
     return task.missed(states[begin:end], begin, goal)
 
 
+def described_errors(errors: Sequence[float] | np.ndarray, begin: float, dt: float) -> str:
+    """Return the errors (T,) [m] to expect of steps of dt [s] from `begin` [s] on in a few words; empty if unknown."""
+    millimetres = 1e3 * np.asarray(errors)
+    if not (len(millimetres) and np.isfinite(millimetres).all()):
+        return ""
+    largest = int(np.argmax(millimetres))
+    judgement = ": more than in usual kicks, trust the plan less" if errors[largest] > USUAL_ERROR else ""
+    usual, at = np.median(millimetres), begin + (largest + 1) * dt
+    return f"{usual:.2f} mm, at most {millimetres[largest]:.2f} mm at {at:.2f} s{judgement}"
+
+
 def facts(task: Task, summary: dict[str, Any]) -> dict[str, str]:
     """Return a task's summary for display: labels, and values with their units."""
     lines = {
@@ -129,6 +146,9 @@ def facts(task: Task, summary: dict[str, Any]) -> dict[str, str]:
         **{name: f"{value:.2f}" for name, value in summary["metrics"].items()},
         **described(summary["gap"]),
     }
+    errors = summary["expected_errors"]
+    if expectation := described_errors(errors["steps_m"], errors["begin_s"], task.scene.dt):
+        lines["expected error of a step"] = expectation
     if summary["fell"]:
         lines["fell"] = "yes"
     if not summary["reachable"]:

@@ -113,7 +113,7 @@ def test_the_world_waits_for_plans_that_take_longer_than_their_horizon() -> None
 
 
 def test_figures_count_the_replans_that_missed_their_deadline() -> None:
-    info = PlanInfo(1.0, {"effort": 1.0}, np.zeros((1, 1, 13)), [], np.zeros(0), 8, 8, 0, 0.02, 0.0)
+    info = PlanInfo(1.0, {"effort": 1.0}, np.zeros((1, 1, 13)), [], np.zeros(0), 8, 8, 0, np.zeros(0), 0.02, 0.0)
     records = [
         PlanRecord(step, 0, np.zeros((1, 13)), Mock(), info, requested=requested, received=received, error=error)
         for step, requested, received, error in ((0, 0, 0, 0.0), (8, 4, 8, 0.002), (16, 12, 19, np.nan))
@@ -126,7 +126,7 @@ def test_figures_count_the_replans_that_missed_their_deadline() -> None:
 
 
 def test_what_is_compared_with_the_kick_is_the_last_plan_that_began_before_it() -> None:
-    info = PlanInfo(1.0, {}, np.zeros((1, 1, 13)), [], np.zeros(0), 8, 8, 0, 0.02, 0.0)
+    info = PlanInfo(1.0, {}, np.zeros((1, 1, 13)), [], np.zeros(0), 8, 8, 0, np.zeros(0), 0.02, 0.0)
     plans = [PlanRecord(step, 0, np.zeros((1, 13)), Mock(), info) for step in (0, 20, 40)]
     assert [last_plan(plans, contact).step for contact in (None, 41, 40, 20, 0)] == [40, 40, 20, 0, 40]
 

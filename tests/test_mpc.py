@@ -222,6 +222,20 @@ def test_the_prediction_goes_on_from_the_last_step_that_is_computed() -> None:
     np.testing.assert_allclose(np.diff(info.states[3:, 0, :3], axis=0), 1.0, rtol=1e-5)
 
 
+def test_a_plan_knows_the_errors_to_expect_of_its_computed_steps_where_the_dynamics_do() -> None:
+    class Honest(PointMass):
+        def expected_errors(self, states: np.ndarray) -> np.ndarray:
+            return np.asarray(np.linalg.norm(np.diff(states[..., 0, :3], axis=-2), axis=-1))
+
+    planner = planner_of(Continued(Honest(), Drift(), slice(0, 1), 5), CEM(samples=8, rounds=1, elites=2))
+    _, info = planner.step(planner.init(jax.random.key(0)), STATE, WINDOW._replace(steps=4))
+    path = np.concatenate([STATE[:, :3], info.states[:4, 0, :3]])
+    np.testing.assert_allclose(info.expected_errors, np.linalg.norm(np.diff(path, axis=0), axis=-1), rtol=1e-5)
+
+    planner = planner_of(PointMass(), CEM(samples=8, rounds=1, elites=2))
+    assert planner.step(planner.init(jax.random.key(0)), STATE, WINDOW)[1].expected_errors.shape == (0,)
+
+
 @pytest.mark.parametrize("steps", [0, HORIZON + 1])
 def test_steps_that_are_not_in_the_horizon_are_refused(steps: int) -> None:
     planner = planner_of(MujocoDynamics(Engine()))

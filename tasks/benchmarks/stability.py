@@ -22,7 +22,7 @@ from larp_model.errors import InputError
 from larp_model.simulator import Simulator
 from mpc import CEM, MPPI, CostTerm, Dynamics, GaussNewton, Gradient, Planner, Window
 from mpc.loop import DivergenceError, Phase, execute
-from tasks.benchmarks import gradients, kick_plans, laws, random_scenes, report, stress, wild_states
+from tasks.benchmarks import gradients, kick_plans, laws, random_scenes, report, step_errors, stress, wild_states
 from tasks.benchmarks.promises import Bench, refusal, row
 from tasks.benchmarks.report import Row
 from tasks.command import prepare_jax, run
@@ -263,6 +263,7 @@ def jobs_of(
         "balls with spin": laws.spinning_balls,
         "slopes of a bounce": laws.bounce_slopes,
         "planners": small_planners,
+        "expected errors": partial(step_errors.expected, seed),
         "targets": partial(kick_plans.targets, bench, continued_model),
         **{
             f"random kicks: {kind}": partial(kick_plans.random_kicks, bench, continued_model, kind, kicks, seed)
