@@ -9,7 +9,7 @@ PYTHON ?= $(shell for python in python3 python3.11 python3.12 python3.13; do \
 RUN := .venv/bin/python -m
 READY := .venv/ready
 
-.PHONY: setup test quick lint docs kick view train bench clean
+.PHONY: setup test quick soak lint docs kick view train bench clean
 
 setup: $(READY)
 
@@ -28,7 +28,11 @@ test: $(READY)
 	@$(RUN) pytest -n 2 --dist loadfile tests
 
 quick: $(READY)
-	@$(RUN) pytest -n 2 --dist loadfile -m "not slow" tests
+	@$(RUN) pytest -n 2 --dist loadfile -m "not slow and not soak" tests
+
+# Thousands of random scenes and damaged files, about a quarter of an hour.
+soak: $(READY)
+	@$(RUN) pytest -n 2 -m soak tests
 
 lint: $(READY)
 	$(RUN) ruff check

@@ -9,7 +9,9 @@ import jax
 import numpy as np
 
 from larp_model import state as packed
-from larp_model.bodies import ball, capsule, chain, human, kicking_links
+from larp_model.anatomy import KINDS as HUMANS
+from larp_model.anatomy import Detail
+from larp_model.bodies import ball, capsule, chain, human, human_and_ball, kicking_links
 from larp_model.engines.mujoco import Truth
 from larp_model.physics import kinematics
 from larp_model.scene import Pair, Scene
@@ -29,6 +31,9 @@ KINDS = (
     "human",
     "human and ball",
     "two humans",
+    "human and capsule",
+    "human whose legs can touch, and ball",
+    "full human and ball",
 )
 
 
@@ -41,12 +46,12 @@ def scene_of_kind(kind: str, random: np.random.Generator | None) -> Scene:
     def size(usual: float) -> float:
         return usual if random is None else float(usual * 10.0 ** random.uniform(-1.0, 1.0))
 
-    def person(name: str) -> Any:
+    def person(name: str, detail: Detail = "lean") -> Any:
         if random is None:
-            return human(name)
+            return human(name, detail=detail)
         segments = ("torso", "upper_arm", "thigh", "shin", "foot")
         lengths, radii = ({segment: float(random.uniform(0.3, 3.0)) for segment in segments} for _ in range(2))
-        return human(name, float(random.uniform(0.3, 3.0)), size(70.0), lengths, radii)
+        return human(name, float(random.uniform(0.3, 3.0)), size(70.0), lengths, radii, detail)
 
     def round_one(name: str) -> Any:
         return ball(name, size(0.11), size(0.43))
@@ -62,15 +67,20 @@ def scene_of_kind(kind: str, random: np.random.Generator | None) -> Scene:
         "human": (person("human"),),
         "human and ball": (person("human"), round_one("ball")),
         "two humans": (person("first"), person("human")),
+        "human and capsule": (person("human"), capsule("capsule", size(0.4), size(0.08), size(1.0))),
+        "human whose legs can touch, and ball": (person("human"), round_one("ball")),
+        "full human and ball": (person("human", "full"), round_one("ball")),
     }
     chosen = bodies[kind]
     if len(chosen) == 1:
         return Scene(chosen)
     first, second = chosen
     first_links, second_links = (
-        kicking_links(body) if body.kind == "human" else tuple(link.name for link in body.links) for body in chosen
+        kicking_links(body) if body.kind in HUMANS.values() else tuple(link.name for link in body.links)
+        for body in chosen
     )
-    return Scene(chosen, (Pair(first.name, second.name, first_links, second_links, ball().surface),))
+    legs = human_and_ball(self_contact=True).within.pairs if "legs" in kind else ()
+    return Scene(chosen, (Pair(first.name, second.name, first_links, second_links, ball().surface), *legs))
 
 
 def random_states(scene: Scene, count: int, random: np.random.Generator) -> np.ndarray:
