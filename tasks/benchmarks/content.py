@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -18,7 +18,8 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from larp_model.anatomy import Detail
-from larp_model.bodies import ball, chain, human, human_and_ball, kicking_links
+from larp_model.bodies import ball, chain, human, human_and_ball, kicking_links, segment_of
+from larp_model.bodies import kicking as kicking_scene
 from larp_model.engines.mujoco import SUBSTEPS
 from larp_model.errors import InputError
 from larp_model.scene import Body, Pair, Scene
@@ -41,8 +42,10 @@ from tasks.motions.references import embedded
 # Distance of neighbours that are out of each other's reach [m].
 APART = 3.0
 RADIUS = ball().links[0].radius
-# Balls in a row; 16 with pairs of neighbours compile for minutes.
-BALLS, MANY = (1, 2, 4), 16
+# Balls in a row.
+BALLS, TOUCHING = (1, 2, 4, 8, 16), 4
+# Segments of the kicking chain.
+CHAIN = ("pelvis", "torso", "thigh", "shin", "foot")
 # Operations that move numbers and compute none.
 MOVES = {
     *("broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "rev", "pad", "concatenate", "split"),
@@ -93,6 +96,35 @@ def person(detail: Detail, name: str = "human", aside: float = 0.0) -> Occupant:
     return Occupant(human(name, detail=detail), state, reference.controls[:STEPS])
 
 
+class KickingChain(NamedTuple):
+    """Trunk and legs of the human, whose torso has the mass of head and arms.
+
+    links, motors: rows of the human's that it has.
+    """
+
+    body: Body
+    links: list[int]
+    motors: list[int]
+
+
+def kicking_chain() -> KickingChain:
+    """Return the kicking chain of the usual human."""
+    whole = human()
+    rows = [row for row, link in enumerate(whole.links) if segment_of(link.name) in CHAIN]
+    links = [whole.links[row] for row in rows]
+    torso = [link.name for link in links].index("torso")
+    rest = sum(link.mass for link in whole.links) - sum(link.mass for link in links)
+    links[torso] = replace(links[torso], mass=links[torso].mass + rest)
+    joints = (whole.joints[row - 1] for row in rows[1:])
+    body = Body(
+        "human",
+        "kicking_chain",
+        tuple(links),
+        tuple(replace(joint, parent=rows.index(joint.parent)) for joint in joints),
+    )
+    return KickingChain(body, rows, [number for number, (child, _, _) in enumerate(whole.motors) if child in rows])
+
+
 def neighbours(occupants: list[Occupant]) -> tuple[Pair, ...]:
     """Return pairs of each body with the next one, of the links that kick or of all."""
 
@@ -126,14 +158,26 @@ def courses(batch: int) -> dict[str, Callable[[], Course]]:
     def with_ball(reach: str) -> Course:
         return course(Question("larp", "human_ball", reach, 1, batch))
 
+    def trunk_and_legs() -> list[Occupant]:
+        kicking, whole = kicking_chain(), person("lean")
+        return [Occupant(kicking.body, whole.state[kicking.links], whole.controls[:, kicking.motors])]
+
+    def struck_by_chain() -> Course:
+        whole, kicking = course(Question("larp", "human_ball", "struck", 1, 1)), kicking_chain()
+        scene = kicking_scene(kicking.body, ball())
+        state = whole.states[0, [*kicking.links, -1]]
+        return course_of(scene, state, whole.controls[0][:, kicking.motors], batch)
+
     links = chain().links
     gap = links[0].length + 2.0 * links[0].radius
     hanging = [(0.0, 0.0, 1.0 + gap * number) for number in reversed(range(len(links)))]
     return {
         **{f"{count} balls, apart" if count > 1 else "ball": of(partial(balls, count, APART), True) for count in BALLS},
-        f"{MANY} balls, apart, without pairs": of(partial(balls, MANY, APART)),
-        f"{BALLS[-1]} balls, in touch": of(partial(balls, BALLS[-1], 2.0 * RADIUS), True),
+        f"{BALLS[-1]} balls, apart, without pairs": of(partial(balls, BALLS[-1], APART)),
+        f"{TOUCHING} balls, in touch": of(partial(balls, TOUCHING, 2.0 * RADIUS), True),
         "chain of 4 links": of(lambda: [at(chain(), *hanging)]),
+        "trunk and legs, 8 links": of(trunk_and_legs),
+        "trunk and legs and ball, struck": struck_by_chain,
         "human, 13 links": of(lambda: [person("lean")]),
         "human, 13 links, whose legs can touch": legs_that_touch,
         "human, 26 links": of(lambda: [person("full")]),
@@ -241,7 +285,8 @@ def picture(rows: list[report.Row]) -> Figure:
     ):
         axes.barh(places + offset, [row[key] for row in rows], 0.34, color=colour, label=label)
     axes.set_yticks(places, [row["content"] for row in rows])
-    axes.set(xscale="log", xlabel="time of a step of one scene [us]")
+    axes.set(xscale="log", xlabel="time of a step of one scene [us]", ylim=(-0.7, len(rows) - 0.3))
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.grid(axis="x", color="0.92")
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
@@ -261,7 +306,7 @@ def main(
         batch: scenes side by side.
         substeps: engine steps of MuJoCo in a step.
         json: where the figures go; the picture goes beside them.
-        publish: put the table into RESULTS.md.
+        publish: put the table into RESULTS.md and the picture into docs/.
     """
     for name, value in (("batch", batch), ("substeps", substeps)):
         if value < 1:
@@ -277,6 +322,7 @@ def main(
     report.write_picture(json.with_suffix(".png"), picture(rows))
     report.show(table_of(rows, settings))
     if publish:
+        report.write_picture(report.PICTURES / "content.png", picture(rows))
         report.publish("content", "Content: what a step costs", settings.command, table_of(rows, settings))
 
 
