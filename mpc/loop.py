@@ -36,6 +36,10 @@ class DivergenceError(RuntimeError):
     """Raised where the world's state is no longer finite, and executing on would mean nothing."""
 
 
+class DeadlineError(InputError):
+    """Raised where plans are expected to take longer than their horizon, and none would be in time."""
+
+
 def never(step: int, state: np.ndarray) -> bool:
     """Return False: nothing ends the phase."""
     return False
@@ -342,11 +346,12 @@ def execute(
     every step. sense: returns the state that the planners get; the true one by default.
     checkpoint: to continue from, without feedback until the next plan; the plans in the result are then those from
     there on. latency: of all plans but the first, for which the world waits; none by default. Raises `DivergenceError`
-    as soon as the world diverges, and InputError where plans are expected to take longer than their horizon.
+    as soon as the world diverges, and `DeadlineError` where plans are expected to take longer than their horizon.
     """
     latency = NoLatency() if latency is None else latency
     if phases and latency.lead >= (horizon := min(phase.replan.horizon for phase in phases)):
-        raise InputError(f"latency: plans take {latency.lead} steps, needs fewer than the planners' horizon, {horizon}")
+        message = f"latency: plans take {latency.lead} steps, needs fewer than the planners' horizon, {horizon}"
+        raise DeadlineError(message)
     execution, loop = Execution([np.asarray(state)]), _Loop(phases, key, latency)
     if checkpoint is not None:
         execution = Execution([*checkpoint.states], [*checkpoint.controls])

@@ -170,6 +170,17 @@ def test_kicks_of_varied_humans_in_real_time_are_those_of_different_humans_and_e
     assert tall.kick.substeps == usual.kick.substeps
 
 
+def test_a_planner_that_makes_no_deadline_has_a_row_that_says_so() -> None:
+    settings = realtime.RealtimeSettings(1, 0, ("5000",), ("fast",), ("mujoco",), (), 4, ("perfect",), ("none",), 0.0)
+    (point,) = settings.points()
+    rows = [job() for job in realtime.jobs_of(settings, [point]).values()]
+    figures = {point: realtime.point_figures(rows)}
+    columns = realtime.table_of(figures, settings).columns
+    (last,) = columns[-1].cells
+    assert "plans take 500 steps, needs fewer than the planners' horizon" in str(last)
+    assert realtime.picture(figures).axes[0].get_xlabel() == ""
+
+
 @pytest.mark.parametrize("delay", ["-1", "soon", "nan", "inf"])
 def test_delays_that_are_none_are_refused(tmp_path: Path, delay: str) -> None:
     with pytest.raises(InputError, match=f"delay is '{delay}', but must be measured, clock or a number of ms"):

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from larp_model.engines.mujoco import SUBSTEPS, Truth
 from larp_model.errors import InputError
-from mpc.loop import Execution, Latency, World
+from mpc.loop import DeadlineError, Execution, Latency, World
 from mpc.realtime import PacedWorld, PlanningThread, SimulatedLatency
 from tasks.benchmarks import report
 from tasks.benchmarks.estimation import EstimateErrors, errors_table, estimate_errors, mean_errors
@@ -215,14 +215,20 @@ class Sessions:
 def kick_row(
     sessions: Sessions, point: RealtimePoint, index: int, target: np.ndarray, shift: np.ndarray, roll: np.ndarray
 ) -> report.Row:
-    """Return the row of a kick: its summary, and what plans made of the time. See `kick.kick_row` for arguments."""
+    """Return the row of a kick: its summary, and what plans made of the time. See `kick.kick_row` for arguments.
+
+    late: why no plan would be in time, in the row of a kick that does not take place.
+    """
     settings, kick, seed = sessions.settings, sessions.kick, sessions.settings.seed + index
     start = kick.start(shift, roll)
     sense = sessions.sensing(point).perception(start, np.random.default_rng((settings.seed, index)))
     latency, world = sessions.timing(point, seed)
-    execution = sessions.session(point.dynamics).execute(
-        sessions.planners(point), target, seed, start, sense=sense, world=world, latency=latency
-    )
+    try:
+        execution = sessions.session(point.dynamics).execute(
+            sessions.planners(point), target, seed, start, sense=sense, world=world, latency=latency
+        )
+    except DeadlineError as error:
+        return {"point": point.name, "seed": seed, "late": str(error)}
     return (
         summary_of(kick, execution, target)
         | timing_figures(execution, kick.scene.dt)
@@ -245,7 +251,9 @@ def estimate_before_contact(kick: Kick, execution: Execution, sense: Perception 
 
 
 def point_figures(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the figures of all kicks of a point."""
+    """Return the figures of all kicks of a point; only `late`, why not, where no plan would be in time."""
+    if late := [row["late"] for row in rows if "late" in row]:
+        return {"late": late[0], "estimate": None}
     truth = np.array([row["truth_error_m"] for row in rows])
 
     def total(name: str) -> int:
@@ -275,10 +283,16 @@ def table_of(figures: dict[RealtimePoint, dict[str, Any]], settings: RealtimeSet
     columns = ("planner", "sees", "delay", "replans/s", "missed", "off by", "mean", "median", "95 %", "fell")
     table = Table(*columns, title=f"Real time, {settings.targets} targets")
     for point, values in figures.items():
-        table.add_row(
+        cells = (
             f"{point.dynamics}, {point.preset}, every {point.interval}",
             point.sees,
             delay_text(point.delay),
+        )
+        if "late" in values:
+            table.add_row(*cells, *[""] * (len(columns) - len(cells) - 1), values["late"])
+            continue
+        table.add_row(
+            *cells,
             f"{values['replans_per_second']:.1f}",
             f"{values['deadlines_missed']} of {values['replans']}",
             f"{1e3 * values['prediction_error_m']:.1f} mm",
@@ -290,12 +304,14 @@ def table_of(figures: dict[RealtimePoint, dict[str, Any]], settings: RealtimeSet
 
 def picture(figures: dict[RealtimePoint, dict[str, Any]]) -> Figure:
     """Plot misses over delay and over the rate of replans, as far as they vary."""
+    figures = {point: values for point, values in figures.items() if "late" not in values}
     delays, rates = ({getattr(point, name) for point in figures} for name in ("delay", "interval"))
     draws = [draw for draw, values in ((_over_delay, delays), (_over_rate, rates)) if len(values) > 1] or [_over_delay]
     figure = Figure(figsize=(5.5 * len(draws), 4.5), layout="constrained")
-    highest = 100.0 * max(value["mean_truth_error_m"] for value in figures.values())
+    highest = 100.0 * max((value["mean_truth_error_m"] for value in figures.values()), default=1.0)
     for draw, axes in zip(draws, figure.subplots(1, len(draws), squeeze=False)[0], strict=True):
-        draw(axes, figures)
+        if figures:
+            draw(axes, figures)
         axes.set(ylabel="miss in MuJoCo [cm]", ylim=(0.0, 1.25 * highest))
         axes.grid(color="0.92")
         axes.set_axisbelow(True)
