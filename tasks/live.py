@@ -20,6 +20,7 @@ import numpy as np
 from larp_model import state as packed
 from larp_model.engines.mujoco import Truth
 from larp_model.errors import InputError
+from larp_model.files import arrays_of
 from larp_model.scene import Scene
 from mpc import Window
 from mpc.loop import DivergenceError, Execution
@@ -419,8 +420,8 @@ def load_recording(task: Task, folder: Path) -> Recording:
     """Return the recording of a saved kick. Raises InputError where it is of another scene, or damaged."""
     try:
         summary = json.loads((folder / "summary.json").read_text())
-        with (folder / f"{task.name}.npz").open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-            states, predicted, plan_step = (file[name] for name in ("states", "predicted_states", "plan_step"))
+        arrays = arrays_of(folder / f"{task.name}.npz")
+        states, predicted, plan_step = (arrays[name] for name in ("states", "predicted_states", "plan_step"))
         target, lines = task.check(tuple(summary["target"])), facts(task, summary)
         expected = np.concatenate([states[int(plan_step)][None], predicted])
     except Exception as error:  # json, numpy and zipfile raise many kinds for a damaged file

@@ -12,7 +12,7 @@ import numpy as np
 from larp_model import state as packed
 from larp_model.engines.mujoco import Truth
 from larp_model.errors import InputError
-from larp_model.files import written_whole
+from larp_model.files import arrays_of, written_whole
 from larp_model.scene import Scene
 
 VERSION = 2
@@ -92,9 +92,9 @@ def save(path: Path, scene: Scene, episodes: Episodes) -> None:
 def load(path: Path, scene: Scene) -> Episodes:
     """Read episodes of this scene; raise InputError for a file that is damaged or does not fit."""
     try:
-        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-            header = dict(json.loads(str(file["header"])))
-            episodes = Episodes(*(file[name] for name in Episodes._fields))
+        arrays = arrays_of(path)
+        header = dict(json.loads(str(arrays["header"])))
+        episodes = Episodes(*(arrays[name] for name in Episodes._fields))
     except FileNotFoundError:
         raise InputError(f"episodes file {path} does not exist") from None
     except Exception as error:  # numpy and zipfile raise many kinds for a damaged file

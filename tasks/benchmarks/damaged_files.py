@@ -115,6 +115,7 @@ def _write_kept_kick(folder: Path, kick: Kick) -> None:
     figures = dict.fromkeys(("model_error_m", "ball_speed_m_s", "reference_deviation_m"), 0.1)
     gap = dict.fromkeys(("launch_error", "links_m")) | {"contact_s": {"truth": None}, "landing_m": {"truth": None}}
     said = {"target": [4.0, 0.0, 0.5], "dynamics": "larp", "preset": "fast", "fell": False, "reachable": True}
+    said |= {"expected_errors": {"begin_s": 0.0, "steps_m": [1e-4, 5e-4]}}
     (folder / "summary.json").write_text(json.dumps({**said, **figures, "metrics": {}, "gap": gap}))
     np.savez(folder / "kick.npz", states=states, predicted_states=states[1:], plan_step=np.array(0))
 

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from larp_model.bodies import human
 from larp_model.errors import InputError
+from larp_model.files import arrays_of
 from larp_model.names import require_file
 from larp_model.scene import Body, Vector, anchor
 from tasks.motions.skeleton import LIMBS, SIDES, Motion
@@ -37,9 +38,7 @@ def load(path: str | Path) -> Motion:
     path = Path(path)
     require_file("path", path)
     try:
-        # numpy does not close the file itself if it is damaged.
-        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-            arrays = dict(file)
+        arrays = arrays_of(path)
     except Exception:  # numpy and zipfile raise many kinds for a damaged file
         raise InputError(f"{path.name} is no npz file of numbers and names") from None
     if missing := [name for name in FIELDS if name not in arrays]:

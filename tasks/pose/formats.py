@@ -18,6 +18,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from larp_model.errors import InputError
+from larp_model.files import arrays_of
 from larp_model.names import require_file, require_known
 from tasks.pose.points import POINTS, RATES, SIDES, Keypoints
 
@@ -274,9 +275,7 @@ def _mediapipe_people(frame: object, size: tuple[float, float] | None) -> list[_
 
 def _npz(path: Path) -> _Film:
     try:
-        # numpy does not close the file itself if it is damaged.
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            content = dict(arrays)
+        content = arrays_of(path)
     except Exception:  # Each part of an archive is damaged in its own way.
         raise InputError("is no whole npz file of numbers and names") from None
     kind, columns = ("points", 3) if "points" in content else ("places", 2)
