@@ -137,7 +137,7 @@ GOOD = text({}, STANDING, STANDING)
         ("a picture\n", "HIERARCHY"),
         (GOOD.replace("MOTION", "NOTION"), "MOTION"),
         (GOOD.replace("Frames: 3", "Frames: many"), "frames"),
-        (GOOD.replace("Frames: 3", "Frames: 4"), "3 frames, but announces 4"),
+        (GOOD.replace("Frames: 3", "Frames: 5"), "3 frames, but announces 5"),
         (GOOD[: GOOD.index("Frame Time")] + "Frame Time: 0.01\n", "no frames"),
         (text({}), "no frames but the T-pose"),
         (GOOD.replace("0.01", "0"), "Frame Time"),
@@ -162,6 +162,96 @@ def test_refused_in_one_line(load: Callable[[str], skeleton.Motion], content: st
     with pytest.raises(InputError, match=expected) as refusal:
         load(content)
     assert str(refusal.value).startswith("clip.bvh ") and "\n" not in str(refusal.value)
+
+
+def axes_exchanged(content: str, order: tuple[int, int, int], signs: tuple[int, int, int]) -> str:
+    """The text in other axes: its numbers x, y, z in this order and with these signs."""
+    names = np.array(["X", "Y", "Z"])[list(order)]
+    hierarchy, frames = content.split("Frame Time: 0.01\n")
+    lines = []
+    for line in hierarchy.splitlines():
+        words = line.split()
+        if words and words[0] == "OFFSET":
+            values = np.array(words[1:], float)[list(order)] * signs
+            line = "OFFSET " + " ".join(map(str, values))
+        elif words and words[0] == "CHANNELS":
+            line = " ".join(
+                "XYZ"[list(names).index(word[0])] + word[1:] if word[0] in "XYZ" else word for word in words
+            )
+        lines.append(line)
+    handed = np.prod(signs) * (1 if order in ((0, 1, 2), (1, 2, 0), (2, 0, 1)) else -1)
+    channels = [word for line in content.splitlines() if line.startswith("CHANNELS") for word in line.split()[2:]]
+    factor = [
+        signs[list(names).index(channel[0])] * (1 if channel.endswith("position") else handed) for channel in channels
+    ]
+    rows = [" ".join(map(str, np.array(row.split(), float) * factor)) for row in frames.splitlines()]
+    return "\n".join(lines) + "\nFrame Time: 0.01\n" + "\n".join(rows) + "\n"
+
+
+SWING = text(*swing(20))
+
+
+@pytest.mark.parametrize(
+    ("order", "signs"), [((0, 2, 1), (1, -1, 1)), ((1, 2, 0), (1, 1, 1)), ((0, 1, 2), (1, -1, -1))]
+)
+def test_the_axis_along_which_the_head_is_above_the_feet_is_up(
+    load: Callable[[str], skeleton.Motion], order: tuple[int, int, int], signs: tuple[int, int, int]
+) -> None:
+    motion, other = load(SWING), load(axes_exchanged(SWING, order, signs))
+    for name in ("Head", "RightToeBase"):
+        np.testing.assert_allclose(other.path(name)[:, 2], motion.path(name)[:, 2], atol=1e-9)
+    (_, expected), (_, vectors) = (skeleton.retarget(each, human(), 0.01) for each in (motion, other))
+    np.testing.assert_allclose(vectors, expected, atol=1e-6)
+
+
+def test_left_handed_axes_are_refused_in_one_line(load: Callable[[str], skeleton.Motion]) -> None:
+    with pytest.raises(InputError, match="has feet that point backwards: its axes are left-handed") as refusal:
+        load(axes_exchanged(SWING, (0, 1, 2), (-1, 1, 1)))
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("unit", [0.01, 0.0254, 0.001, 0.3048, 1.0])
+def test_the_length_of_the_legs_tells_the_unit(load: Callable[[str], skeleton.Motion], unit: float) -> None:
+    factor = 0.01 / unit
+    lines = [
+        "OFFSET " + " ".join(str(factor * float(word)) for word in line.split()[1:])
+        if line.startswith("OFFSET")
+        else line
+        for line in SWING.splitlines()
+    ]
+    assert load("\n".join(lines) + "\n").hip_height == pytest.approx(load(SWING).hip_height, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        "\ufeff" + SWING,
+        SWING.replace("\n", "\r\n"),
+        SWING.replace("Frames: 21", "Frames:21").replace("Frame Time: ", "Frame Time:"),
+        SWING.replace("Frames: 21", "Frames: 20"),
+        SWING.replace("Frames: 21", "Frames: 22"),
+        *(
+            SWING.replace("ROOT ", f"ROOT {prefix}").replace("JOINT ", f"JOINT {prefix}")
+            for prefix in ("Character1_", "Bip01_", "mixamorig:", "a_b_")
+        ),
+    ],
+)
+def test_what_writers_do_differently_changes_nothing(load: Callable[[str], skeleton.Motion], changed: str) -> None:
+    motion, other = load(SWING), load(changed)
+    assert other.names == motion.names
+    np.testing.assert_array_equal(other.orientations, motion.orientations)
+
+
+@given(frames=st.integers(2, 300), rate=st.floats(5.0, 1000.0), dt=st.sampled_from([0.004, 0.01, 0.02, 1.0 / 60.0]))
+def test_sampled_times_reach_from_the_first_frame_to_the_last_and_not_beyond(
+    frames: int, rate: float, dt: float
+) -> None:
+    times, last = skeleton.sampled_times(frames, rate, dt), (frames - 1) / rate
+    assert times[0] == 0.0 and times[-1] <= last < times[-1] + dt * (1.0 + 1e-9)
+
+
+def test_a_film_of_whole_steps_is_sampled_to_its_end() -> None:
+    assert len(skeleton.sampled_times(100, 60.0, 0.01)) == 166
 
 
 def test_what_is_written_is_read_again(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 A BVH file is a tree of joints with offsets and, for every frame, the angles of all joints (M. Meredith and S. Maddock,
 "Motion capture file formats explained", 2001). Here its joints have MotionBuilder's names, as in B. Hahne's conversion
 of the Carnegie Mellon motion capture database; a table for each other skeleton gives the names in its files. Files have
-y up and face z; here z is up, x forward and y left.
+y up and face z, or another axis up, as head and feet of the person tell; here z is up, x forward and y left.
 """
 
 from __future__ import annotations
@@ -41,14 +41,20 @@ SKELETONS = {
     "LAFAN1": {name: name.replace("ToeBase", "Toe") for name in NEEDED},
     "ASF": {"Hips": "root", **ASF},
 }
-# Metres in one unit of a file: the Carnegie Mellon conversions', a centimetre, a metre. The length of the legs decides.
-UNITS = (0.0254 / 0.45, 0.01, 1.0)
+# Metres in one unit of a file: the Carnegie Mellon conversions', a centimetre, a metre, an inch, a foot, a millimetre.
+# The length of the legs decides.
+UNITS = (0.0254 / 0.45, 0.01, 1.0, 0.0254, 0.3048, 0.001)
 LEG_LENGTH = (0.6, 1.2)
 _OURS = {"X": "Y", "Y": "Z", "Z": "X"}  # our axis for each of a file's axes; positions are reordered accordingly
 _TO_OURS, _TO_FILE = [2, 0, 1], [1, 2, 0]
 _ROTATION_CHANNELS = ("Zrotation", "Xrotation", "Yrotation")
 _LARGEST = 1e6
 _PREFIX = re.compile(r"^(.*:|mixamorig\d*_)")  # of a whole skeleton, as in mixamorig:Hips
+_FRAMES, _FRAME_TIME = re.compile(r"Frames:\s*(\d+)"), re.compile(r"Frame Time:\s*(\S+)")
+# Share of the distance from feet to head that is along the axis that is up, at least.
+UPRIGHT = 0.8
+# Share of the feet's length that the toes are ahead of the heels, in the direction that the hips face, at least.
+AHEAD = -0.3
 
 
 def load(path: str | Path, names: Mapping[str, str] | None = None) -> Motion:
@@ -63,7 +69,7 @@ def load(path: str | Path, names: Mapping[str, str] | None = None) -> Motion:
     require_file("path", path)
     tables = list(SKELETONS.values()) if names is None else [_table(names)]
     try:
-        joints, duration, data = _parse(path.read_bytes().decode("ascii", "replace").splitlines())
+        joints, duration, data = _parse(path.read_bytes().decode("utf-8-sig", "replace").splitlines())
         return _motion_in_metres(_renamed(joints, tables), duration, data)
     except InputError as error:
         raise InputError(f"{path.name} {error}") from None
@@ -152,16 +158,18 @@ def _parse(lines: list[str]) -> tuple[list[_FileJoint], float, np.ndarray]:
     if start is None or rows[0][1] != ["HIERARCHY"]:
         raise InputError("is no BVH file: it needs a line HIERARCHY first and a line MOTION later")
     joints = _hierarchy(word for _, words in rows[1:start] for word in words)
-    match [words for _, words in rows[start + 1 : start + 3]]:
-        case [["Frames:", count], ["Frame", "Time:", seconds]] if count.isdecimal():
-            (duration,) = _numbers([seconds], 1, "has a Frame Time that")
-        case _:
-            raise InputError("has no frames: it needs lines 'Frames: N' and 'Frame Time: SECONDS' after MOTION")
+    head = [" ".join(words) for _, words in rows[start + 1 : start + 3]]
+    matches = [pattern.fullmatch(line) for pattern, line in zip((_FRAMES, _FRAME_TIME), head, strict=False)]
+    if len(matches) < 2 or matches[0] is None or matches[1] is None:
+        raise InputError("has no frames: it needs lines 'Frames: N' and 'Frame Time: SECONDS' after MOTION")
+    count, seconds = (match[1] for match in matches if match)
+    (duration,) = _numbers([seconds], 1, "has a Frame Time that")
     if not 0.0 < duration <= 0.1:
         raise InputError(f"has a Frame Time of {duration:g} s, but needs one above 0 and up to 0.1 s")
     columns = sum(len(joint.channels) for joint in joints)
     data = [_numbers(words, columns, f"has a line, {number}, that") for number, words in rows[start + 3 :]]
-    if not data or len(data) != int(count):
+    # Some writers count one frame too many or too few.
+    if not data or abs(len(data) - int(count[:9])) > 1:
         raise InputError(f"has {len(data) or 'no'} frames, but announces {count[:9]}")
     return joints, duration, np.array(data)
 
@@ -216,8 +224,20 @@ def _hierarchy(words: Iterator[str]) -> list[_FileJoint]:
     return joints
 
 
+def _without_prefix(names: list[str]) -> list[str]:
+    """Return names without what all of them begin with, up to an underscore, as in Character1_Hips."""
+    first, last = min(names, default=""), max(names, default="")
+    same = next((place for place, pair in enumerate(zip(first, last, strict=False)) if len({*pair}) > 1), 0)
+    prefix = first[: first.rfind("_", 0, same) + 1]
+    return [name.removeprefix(prefix) for name in names]
+
+
 def _renamed(joints: list[_FileJoint], tables: list[dict[str, str]]) -> list[_FileJoint]:
     """Return the joints, the needed ones renamed to ours by the first table with the fewest missing."""
+    full_names = [joint.name for joint in joints]
+    short_names = dict(zip(full_names, _without_prefix(full_names), strict=True))
+    joints = [replace(joint, name=short_names[joint.name]) for joint in joints]
+    tables = [{name: short_names.get(own, own) for name, own in table.items()} for table in tables]
     file_names = [joint.name for joint in joints]
     table = min(tables, key=lambda table: len(set(table.values()) - set(file_names)))
     if missing := {our_name: file_name for our_name, file_name in table.items() if file_name not in file_names}:
@@ -236,16 +256,21 @@ def _renamed(joints: list[_FileJoint], tables: list[dict[str, str]]) -> list[_Fi
 def _motion_in_metres(joints: list[_FileJoint], duration: float, data: np.ndarray) -> Motion:
     """Return the motion of all frames, in metres, with joint frames made parallel in the rest pose."""
     channels = np.concatenate([_unrotated(joints)[None], data])
-    unscaled = _forward_kinematics(joints, duration, channels)
+    unscaled = _upright(_forward_kinematics(joints, duration, channels))
     thighs, shins = ([bone(unscaled, side + joint)[0] for side in SIDES] for joint in ("UpLeg", "Leg"))
     leg_length = float(np.linalg.norm(thighs, axis=-1).mean() + np.linalg.norm(shins, axis=-1).mean())
     unit = next((unit for unit in UNITS if LEG_LENGTH[0] <= unit * leg_length <= LEG_LENGTH[1]), None)
     if unit is None:
         raise InputError(
-            f"has legs {leg_length:.3g} units long, but needs 0.6 to 1.2 m in units of 0.0254/0.45 m, cm or m"
+            f"has legs {leg_length:.3g} units long, but needs 0.6 to 1.2 m in units of 0.0254/0.45 m, mm, cm, m, "
+            "inches or feet"
         )
     if unscaled.chest == unscaled.names[0]:
         raise InputError("has no chest: its arms branch off the root")
+    if _toes_ahead(unscaled.cut(1, len(channels))) < AHEAD:
+        raise InputError(
+            "has feet that point backwards: its axes are left-handed, or its sides exchanged; mirror x, or the names"
+        )
     rest_frame = next((pose for pose in (1, 0) if is_t_pose(unscaled, pose)), None)
     if rest_frame is None:
         rest, rest_frame = rest_orientations(unscaled.cut(1, len(channels))), 0
@@ -266,6 +291,40 @@ def _motion_in_metres(joints: list[_FileJoint], duration: float, data: np.ndarra
         positions=unit * unscaled.positions[1 + rest_frame :],
         orientations=orientations,
     )
+
+
+def _upright(motion: Motion) -> Motion:
+    """Return a motion, whose first frame is the pose without rotations, turned so that z is up.
+
+    The axis of the file is up along which the head is above the feet, in the mean over the frames; y where none is, as
+    of people who lie and roll.
+    """
+    feet = 0.5 * (motion.path("LeftFoot") + motion.path("RightFoot"))
+    spine = (motion.path("Head") - feet)[1:]
+    up = np.mean(spine, axis=0) / max(float(np.mean(np.linalg.norm(spine, axis=-1))), 1e-9)
+    axis = int(np.argmax(np.abs(up)))
+    if (axis == 2 and up[axis] > 0.0) or abs(up[axis]) < UPRIGHT:
+        return motion
+    turn, _ = Rotation.align_vectors([(0.0, 0.0, 1.0)], [np.sign(up[axis]) * np.eye(3)[axis]])
+    shape = motion.orientations.shape
+    turned = turn * Rotation.from_quat(motion.orientations.reshape(-1, 4), scalar_first=True)
+    return replace(
+        motion,
+        positions=turn.apply(motion.positions.reshape(-1, 3)).reshape(motion.positions.shape),
+        orientations=turned.as_quat(scalar_first=True).reshape(shape),
+    )
+
+
+def _toes_ahead(motion: Motion) -> float:
+    """Return how far the toes are ahead of the heels in the direction that the hips face, as a share of their distance.
+
+    The mean over both feet and all frames, for one who stands.
+    """
+    across = motion.path("LeftUpLeg") - motion.path("RightUpLeg")
+    ahead = np.stack([across[:, 1], -across[:, 0]], axis=-1)
+    feet = sum(motion.path(f"{side}ToeBase") - motion.path(f"{side}Foot") for side in SIDES)[:, :2]
+    lengths = np.linalg.norm(ahead, axis=-1) * np.linalg.norm(feet, axis=-1)
+    return float(np.sum(ahead * feet) / max(float(np.sum(lengths)), 1e-9))
 
 
 def _unrotated(joints: list[_FileJoint]) -> np.ndarray:

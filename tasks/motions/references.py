@@ -215,11 +215,10 @@ def _retargeted(scene: Scene, clip: Motion) -> tuple[np.ndarray, np.ndarray]:
     rows = scene.rows(human.name)
     height_ratio = standing_height(human) / clip.hip_height
     hip_displacement = height_ratio * (clip.path("Hips") - clip.path("Hips")[0])
-    times = np.arange(len(hip_displacement)) / clip.rate
+    frames = len(hip_displacement)
+    times, step_times = np.arange(frames) / clip.rate, skeleton.sampled_times(frames, clip.rate, scene.dt)
     for axis in (0, 1):
-        states[:, rows, axis] += np.interp(np.arange(len(targets)) * scene.dt, times, hip_displacement[:, axis])[
-            :, None
-        ]
+        states[:, rows, axis] += np.interp(step_times, times, hip_displacement[:, axis])[:, None]
     states[:, rows, packed.VELOCITY] = np.gradient(states[:, rows, packed.POSITION], scene.dt, axis=0)
     states[:, rows] = with_angular_velocities(states[:, rows], scene.dt)
     states[:, -1, packed.POSITION] = (-50.0, 0.0, ball.links[0].radius)

@@ -119,6 +119,13 @@ def mirrored(motion: Motion) -> Motion:
     )
 
 
+def sampled_times(frames: int, rate: float, dt: float) -> np.ndarray:
+    """Return times [s] of steps of `dt` [s] from the first of some frames of a rate [1/s] on, none after the last."""
+    last = (frames - 1) / rate
+    times: np.ndarray = np.minimum(np.arange(int(last / dt + 1e-6) + 1) * dt, last)
+    return times
+
+
 def retarget(motion: Motion, body: Body, dt: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the motion as poses of our human, every `dt` [s].
 
@@ -133,11 +140,9 @@ def retarget(motion: Motion, body: Body, dt: float) -> tuple[np.ndarray, np.ndar
         raise InputError(
             f"dt is {dt!r}, the motion has {len(motion.positions)} frames; needs dt above 0 and two frames"
         )
-    times = np.arange(len(motion.positions)) / motion.rate
-    step_times = np.arange(int(times[-1] / dt + 1e-6) + 1) * dt
-    rotations = [
-        Slerp(times, _link_rotation(motion, link.name))(np.minimum(step_times, times[-1])) for link in body.links
-    ]
+    frames = len(motion.positions)
+    times, step_times = np.arange(frames) / motion.rate, sampled_times(frames, motion.rate, dt)
+    rotations = [Slerp(times, _link_rotation(motion, link.name))(step_times) for link in body.links]
     controls = np.stack(
         [(rotations[joint.parent].inv() * rotations[child]).as_rotvec() for child, joint, _ in body.motors], axis=1
     )

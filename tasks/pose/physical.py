@@ -32,6 +32,7 @@ from mpc import CostTerm, Dynamics, GaussNewton, Optimizer, Planner, Verified, W
 from mpc.loop import Checkpoint, Execution, Phase, execute
 from tasks.exploration import exploration_std
 from tasks.motions.references import clearance, with_angular_velocities, with_servo_lead
+from tasks.motions.skeleton import sampled_times
 from tasks.pose.camera import Camera
 from tasks.pose.figure import Figure, Pose
 from tasks.pose.lift import OUTLIER, STANDING_SPEED, Lifted, noise
@@ -89,7 +90,7 @@ def filmed_motion(scene: Scene, figure: Figure, lifted: Lifted, keypoints: Keypo
     """Return the kinematic start and the keypoints, resampled to the steps of the scene."""
     human = scene.human
     frame_times, rate = keypoints.times, keypoints.rate
-    times = np.arange(int(frame_times[-1] / scene.dt + 1e-6) + 1) * scene.dt
+    times = sampled_times(len(keypoints), rate, scene.dt)
     place = interpolated(lifted.pose.place, rate, times)
     root = Slerp(frame_times, Rotation.from_matrix(lifted.pose.turn))(times)
     angles = np.clip(interpolated(lifted.pose.angles, rate, times), figure.lower, figure.upper)
