@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -240,6 +241,56 @@ def test_what_writers_do_differently_changes_nothing(load: Callable[[str], skele
     motion, other = load(SWING), load(changed)
     assert other.names == motion.names
     np.testing.assert_array_equal(other.orientations, motion.orientations)
+
+
+CLASSIC = {"UpLeg": "Hip", "Leg": "Knee", "Foot": "Ankle", "Arm": "Shoulder", "ForeArm": "Elbow", "Hand": "Wrist"}
+
+
+def with_toes_at_end_sites(content: str, names: dict[str, str]) -> str:
+    """The text without joints at the toes, where the feet end instead; names: of joints without their sides."""
+    for side in ("Left", "Right"):
+        begin = content.index(f"JOINT {side}ToeBase")
+        end = content.index("}\n}\n", begin) + 4
+        offset = content[content.index("OFFSET", begin) : content.index("CHANNELS", begin)]
+        content = content[:begin] + f"End Site\n{{\n{offset}}}\n" + content[end:]
+    hierarchy, frames = content.split("Frame Time: 0.01\n")
+    for own, other in names.items():
+        for side in ("Left", "Right"):
+            hierarchy = hierarchy.replace(f"JOINT {side}{own}\n", f"JOINT {side}{other}\n")
+    order = [name for name in re.findall(r"(?:ROOT|JOINT) (\w+)", SWING)]
+    columns = [0, 1, 2] + [
+        3 + 3 * row + axis for row, name in enumerate(order) if "ToeBase" not in name for axis in range(3)
+    ]
+    rows = [" ".join(np.array(row.split())[columns]) for row in frames.splitlines()]
+    return hierarchy + "Frame Time: 0.01\n" + "\n".join(rows) + "\n"
+
+
+@pytest.mark.parametrize("names", [{}, CLASSIC], ids=["ours", "Biovision's"])
+def test_toes_without_a_joint_are_where_the_foot_ends(
+    load: Callable[[str], skeleton.Motion], names: dict[str, str]
+) -> None:
+    motion, other = load(SWING), load(with_toes_at_end_sites(SWING, names))
+    assert other.names == motion.names
+    for name in ("LeftToeBase", "RightToeBase", "RightForeArm"):
+        np.testing.assert_allclose(other.path(name), motion.path(name), atol=1e-9)
+
+
+def hanging(content: str) -> str:
+    """The text with arms that hang where the T-pose's are level, and turned as much less."""
+    for sign in (1, -1):
+        for length in (28, 25):
+            content = content.replace(f"OFFSET {sign * length} 0 0\n", f"OFFSET 0 {-length} 0\n")
+    return content
+
+
+def test_a_pose_without_rotations_in_which_all_limbs_hang_is_the_rest_pose(
+    load: Callable[[str], skeleton.Motion],
+) -> None:
+    straight = [{"RightUpLeg": (0.0, 0.0, -angle)} for angle in np.linspace(-20.0, 40.0, 20)]
+    level = load(text({}, *(STANDING | frame for frame in straight)))
+    down = load(hanging(text(*straight)))
+    (_, expected), (_, vectors) = (skeleton.retarget(each, human(), 0.01) for each in (level, down))
+    np.testing.assert_allclose(vectors, expected, atol=1e-6)
 
 
 @given(frames=st.integers(2, 300), rate=st.floats(5.0, 1000.0), dt=st.sampled_from([0.004, 0.01, 0.02, 1.0 / 60.0]))

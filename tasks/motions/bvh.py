@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from larp_model.errors import InputError
 from larp_model.names import require_file
 from tasks.motions.rest_pose import rest_orientations
-from tasks.motions.skeleton import NEEDED, SIDES, Motion, bone, facing, is_t_pose
+from tasks.motions.skeleton import ENDS, NEEDED, SIDES, Motion, bone, facing, is_t_pose
 
 # The bones of the Carnegie Mellon database's own ASF files, each named at the joint where it begins.
 BONES = {
@@ -35,11 +35,18 @@ BONES = {
     "ToeBase": "toes",
 }
 ASF = {"Head": "head", **{side + name: side[0].lower() + bone for side in SIDES for name, bone in BONES.items()}}
+# Joints of Biovision's and Xsens' files.
+_JOINTS = {
+    "Arm": "Shoulder", "ForeArm": "Elbow", "Hand": "Wrist", "UpLeg": "Hip", "Leg": "Knee", "Foot": "Ankle",
+    "ToeBase": "Toe",
+}  # fmt: skip
 # Names of the needed joints in the files of each known skeleton; Mixamo's names are MotionBuilder's, prefixed.
 SKELETONS = {
     "MotionBuilder": {name: name for name in NEEDED},
     "LAFAN1": {name: name.replace("ToeBase", "Toe") for name in NEEDED},
     "ASF": {"Hips": "root", **ASF},
+    "Biovision": {name: name for name in ("Hips", "Head")}
+    | {side + name: side + own for side in SIDES for name, own in _JOINTS.items()},
 }
 # Metres in one unit of a file: the Carnegie Mellon conversions', a centimetre, a metre, an inch, a foot, a millimetre.
 # The length of the legs decides.
@@ -49,8 +56,11 @@ _OURS = {"X": "Y", "Y": "Z", "Z": "X"}  # our axis for each of a file's axes; po
 _TO_OURS, _TO_FILE = [2, 0, 1], [1, 2, 0]
 _ROTATION_CHANNELS = ("Zrotation", "Xrotation", "Yrotation")
 _LARGEST = 1e6
+_END = " (end)"
 _PREFIX = re.compile(r"^(.*:|mixamorig\d*_)")  # of a whole skeleton, as in mixamorig:Hips
 _FRAMES, _FRAME_TIME = re.compile(r"Frames:\s*(\d+)"), re.compile(r"Frame Time:\s*(\S+)")
+# Largest angle of limbs that hang from vertical, and of their feet from straight ahead [rad].
+HANGING = 0.3
 # Share of the distance from feet to head that is along the axis that is up, at least.
 UPRIGHT = 0.8
 # Share of the feet's length that the toes are ahead of the heels, in the direction that the hips face, at least.
@@ -61,9 +71,10 @@ def load(path: str | Path, names: Mapping[str, str] | None = None) -> Motion:
     """Read a BVH file; an InputError of one line names what is missing, damaged or not understood.
 
     names: the file's names of the joints of `NEEDED`, {"Hips": "pelvis", ...}; joints left out have our names. By
-    default, the table of `SKELETONS` that fits the file best. Prefixes, as in mixamorig:Hips, are removed. The rest
-    pose is the first frame if that is a T-pose, which is then left out, else the pose without rotations if that is
-    one, else the estimate of `rest_pose` from the frames.
+    default, the table of `SKELETONS` that fits the file best. Prefixes, as in mixamorig:Hips, are removed. Toes that a
+    file does not have are at the end sites of the feet. The rest pose is the first frame if that is a T-pose, which is
+    then left out, else the pose without rotations if that is one or if all limbs hang, else the estimate of `rest_pose`
+    from the frames.
     """
     path = Path(path)
     require_file("path", path)
@@ -145,6 +156,8 @@ def _table(names: Mapping[str, str]) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class _FileJoint:
+    """A joint, or the end site of one, which has no channels."""
+
     name: str
     parent: int
     offset: list[float]
@@ -187,7 +200,7 @@ def _numbers(words: list[str], count: int, place: str) -> list[float]:
 
 
 def _hierarchy(words: Iterator[str]) -> list[_FileJoint]:
-    """Return the tree of joints, parents first; end sites are read and left out."""
+    """Return the tree of joints and end sites, parents first."""
     joints: list[_FileJoint] = []
     ancestors: list[int] = []
 
@@ -201,8 +214,9 @@ def _hierarchy(words: Iterator[str]) -> list[_FileJoint]:
             ancestors.pop()
         elif word == "End" and ancestors:
             expect("Site", "{", "OFFSET")
-            _numbers(list(islice(words, 3)), 3, "has an End Site that")
+            offset = _numbers(list(islice(words, 3)), 3, "has an End Site that")
             expect("}")
+            joints.append(_FileJoint(_end_name(joints, ancestors[-1]), ancestors[-1], offset, []))
         elif word == ("JOINT" if ancestors else "ROOT") and (ancestors or not joints):
             name = _PREFIX.sub("", next(words, ""))
             expect("{", "OFFSET")
@@ -224,6 +238,11 @@ def _hierarchy(words: Iterator[str]) -> list[_FileJoint]:
     return joints
 
 
+def _end_name(joints: list[_FileJoint], parent: int) -> str:
+    """Return a name for one more end site of a joint."""
+    return joints[parent].name + _END * (1 + sum(joint.parent == parent and not joint.channels for joint in joints))
+
+
 def _without_prefix(names: list[str]) -> list[str]:
     """Return names without what all of them begin with, up to an underscore, as in Character1_Hips."""
     first, last = min(names, default=""), max(names, default="")
@@ -232,12 +251,29 @@ def _without_prefix(names: list[str]) -> list[str]:
     return [name.removeprefix(prefix) for name in names]
 
 
+def _with_toes_at_ends(table: dict[str, str], file_names: set[str], sites: set[str]) -> dict[str, str]:
+    """Return the table with the end sites of the feet in place of toes that a file does not have."""
+    ends = {side + "ToeBase": table[side + "Foot"] + _END for side in SIDES}
+    return table | {name: end for name, end in ends.items() if table[name] not in file_names and end in sites}
+
+
+def _without(joints: list[_FileJoint], sites: set[str]) -> list[_FileJoint]:
+    """Return the joints without these end sites."""
+    rows = [row for row, joint in enumerate(joints) if joint.name not in sites]
+    return [
+        replace(joints[row], parent=rows.index(joints[row].parent) if joints[row].parent >= 0 else -1) for row in rows
+    ]
+
+
 def _renamed(joints: list[_FileJoint], tables: list[dict[str, str]]) -> list[_FileJoint]:
     """Return the joints, the needed ones renamed to ours by the first table with the fewest missing."""
     full_names = [joint.name for joint in joints]
     short_names = dict(zip(full_names, _without_prefix(full_names), strict=True))
     joints = [replace(joint, name=short_names[joint.name]) for joint in joints]
     tables = [{name: short_names.get(own, own) for name, own in table.items()} for table in tables]
+    sites = {joint.name for joint in joints if not joint.channels}
+    tables = [_with_toes_at_ends(table, {joint.name for joint in joints}, sites) for table in tables]
+    joints = _without(joints, sites - {own for table in tables for own in table.values()})
     file_names = [joint.name for joint in joints]
     table = min(tables, key=lambda table: len(set(table.values()) - set(file_names)))
     if missing := {our_name: file_name for our_name, file_name in table.items() if file_name not in file_names}:
@@ -272,6 +308,8 @@ def _motion_in_metres(joints: list[_FileJoint], duration: float, data: np.ndarra
             "has feet that point backwards: its axes are left-handed, or its sides exchanged; mirror x, or the names"
         )
     rest_frame = next((pose for pose in (1, 0) if is_t_pose(unscaled, pose)), None)
+    if rest_frame is None and _hangs(unscaled):
+        rest_frame = 0
     if rest_frame is None:
         rest, rest_frame = rest_orientations(unscaled.cut(1, len(channels))), 0
     else:
@@ -327,6 +365,13 @@ def _toes_ahead(motion: Motion) -> float:
     return float(np.sum(ahead * feet) / max(float(np.sum(lengths)), 1e-9))
 
 
+def _hangs(motion: Motion) -> bool:
+    """Return whether in its first frame all limbs hang straight down and the toes are ahead, as in our rest pose."""
+    bones = (bone(motion, side + joint)[0] for side in SIDES for joint in ENDS)
+    hanging = all(-direction[2] > np.cos(HANGING) * np.linalg.norm(direction) for direction in bones)
+    return hanging and _toes_ahead(motion.cut(0, 0)) > np.cos(HANGING)
+
+
 def _unrotated(joints: list[_FileJoint]) -> np.ndarray:
     """Return the channels (C,) of the pose without rotations; joints that have positions are at their offsets."""
     values = []
@@ -345,10 +390,11 @@ def _forward_kinematics(joints: list[_FileJoint], duration: float, poses: np.nda
         channels = dict(zip(joint.channels, poses.T[column : column + len(joint.channels)], strict=True))
         column += len(joint.channels)
         rotation_channels = [channel for channel in joint.channels if channel.endswith("rotation")]
-        angles = np.stack([channels[channel] for channel in rotation_channels], axis=-1)
-        rotation = Rotation.from_euler(
-            "".join(_OURS[channel[0]] for channel in rotation_channels), angles, degrees=True
-        )
+        rotation = Rotation.identity(len(poses))
+        if rotation_channels:
+            angles = np.stack([channels[channel] for channel in rotation_channels], axis=-1)
+            axes = "".join(_OURS[channel[0]] for channel in rotation_channels)
+            rotation = Rotation.from_euler(axes, angles, degrees=True)
         offset = np.array(joint.offset)[_TO_OURS]
         position = np.stack([channels[f"{axis}position"] for axis in "ZXY"], axis=-1) if len(channels) > 3 else offset
         if joint.parent < 0:
