@@ -21,9 +21,8 @@ TINY = 1e-12
 def expected_errors(scene: Scene, states: Any, morphology: Any) -> Any:
     """Return the errors (*, T) [m] to expect of T single steps by physics, as distances of the links in the mean.
 
-    states: (*, T + 1, L, 13) before and after each step. morphology: (L, 3) or (*, L, 3). Arrays of NumPy or
-    of JAX. Each error is
-    of its step alone, from a true state: errors of steps before it add to the distance of a rollout.
+    states: (*, T + 1, L, 13) before and after each step. morphology: (L, 3) or (*, L, 3). Arrays of NumPy or of JAX.
+    Each error is of its step alone, from a true state: errors of steps before it add to the distance of a rollout.
     """
     xp = states.__array_namespace__()
     velocity, turning = (

@@ -18,8 +18,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from larp_model.anatomy import Detail
-from larp_model.bodies import ball, chain, human, human_and_ball, kicking_links, segment_of
-from larp_model.bodies import kicking as kicking_scene
+from larp_model.bodies import ball, chain, human, human_and_ball, kicking, kicking_links, segment_of
 from larp_model.engines.mujoco import SUBSTEPS
 from larp_model.errors import InputError
 from larp_model.scene import Body, Pair, Scene
@@ -159,14 +158,13 @@ def courses(batch: int) -> dict[str, Callable[[], Course]]:
         return course(Question("larp", "human_ball", reach, 1, batch))
 
     def trunk_and_legs() -> list[Occupant]:
-        kicking, whole = kicking_chain(), person("lean")
-        return [Occupant(kicking.body, whole.state[kicking.links], whole.controls[:, kicking.motors])]
+        part, whole = kicking_chain(), person("lean")
+        return [Occupant(part.body, whole.state[part.links], whole.controls[:, part.motors])]
 
     def struck_by_chain() -> Course:
-        whole, kicking = course(Question("larp", "human_ball", "struck", 1, 1)), kicking_chain()
-        scene = kicking_scene(kicking.body, ball())
-        state = whole.states[0, [*kicking.links, -1]]
-        return course_of(scene, state, whole.controls[0][:, kicking.motors], batch)
+        part, whole = kicking_chain(), course(Question("larp", "human_ball", "struck", 1, 1))
+        state = whole.states[0, [*part.links, -1]]
+        return course_of(kicking(part.body, ball()), state, whole.controls[0][:, part.motors], batch)
 
     links = chain().links
     gap = links[0].length + 2.0 * links[0].radius
