@@ -68,6 +68,7 @@ def precision(bench: Bench) -> list[Row]:
         worst = float(error[:steps].max())
         promise = f"LARP: within {1e3 * limit:g} mm of float64 for {steps} steps"
         rows.append(row("precision", f"float32, {steps} steps", promise, f"{1e3 * worst:.2g} mm", worst <= limit))
+    rows.append(_price_of_bfloat16(bench, start, controls, single))
     for kind in (jnp.bfloat16, jnp.float16, jnp.int32):
         for name, call in (
             ("step", partial(bench.model.step, control=jnp.asarray(controls[:, 0]))),
@@ -76,6 +77,17 @@ def precision(bench: Bench) -> list[Row]:
             observation, passed = refusal(partial(call, jnp.asarray(start, kind)), "state has numbers of type")
             rows.append(row("precision", f"{kind.__name__}, {name}", "LARP: refused by name", observation, passed))
     return rows
+
+
+def _price_of_bfloat16(bench: Bench, start: np.ndarray, controls: np.ndarray, single: np.ndarray) -> Row:
+    """Return the row of a rollout whose states are rounded to bfloat16 after each step: why that is refused."""
+    step, state, error = jax.jit(bench.model.step), jnp.asarray(start), 0.0
+    for number in range(10):
+        state = step(state.astype(jnp.bfloat16).astype(jnp.float32), controls[:, number])
+        change = np.asarray(state)[0] - single[0, number]
+        error = max(error, float(np.linalg.norm(change[:, packed.POSITION], axis=-1).max()))
+    promise = "refused for its price: more than the 1 mm that float32 keeps"
+    return row("precision", "bfloat16 states, 10 steps", promise, f"{1e3 * error:.2g} mm", error > 1e-3)
 
 
 def batches(bench: Bench) -> list[Row]:
