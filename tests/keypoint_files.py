@@ -37,6 +37,11 @@ BODY_25 = {
     "left_ankle": 14, "right_ear": 17, "left_ear": 18, "left_toe": 19, "left_heel": 21, "right_toe": 22,
     "right_heel": 24,
 }  # fmt: skip
+BODY_25B = {**COCO, "left_toe": 19, "left_heel": 21, "right_toe": 22, "right_heel": 24}
+H36M = {
+    "right_hip": 1, "right_knee": 2, "right_ankle": 3, "left_hip": 4, "left_knee": 5, "left_ankle": 6,
+    "left_shoulder": 11, "left_elbow": 12, "left_wrist": 13, "right_shoulder": 14, "right_elbow": 15, "right_wrist": 16,
+}  # fmt: skip
 MEDIAPIPE = {
     "nose": 0, "left_ear": 7, "right_ear": 8, "left_shoulder": 11, "right_shoulder": 12, "left_elbow": 13,
     "right_elbow": 14, "left_wrist": 15, "right_wrist": 16, "left_hip": 23, "right_hip": 24, "left_knee": 25,
@@ -49,6 +54,7 @@ OUR_ORDER = {name: row for row, name in enumerate(POINTS)}
 Person = np.ndarray
 Film = list[list[Person]]
 Write = Callable[[Path, Film], Path]
+Ends = tuple[float, float]
 
 
 def rows(person: Person, order: dict[str, int], count: int) -> np.ndarray:
@@ -65,12 +71,21 @@ def dump(path: Path, content: object) -> Path:
     return path
 
 
-def openpose(order: dict[str, int], count: int) -> Write:
+def openpose(order: dict[str, int], count: int, key: str = "pose_keypoints_2d", ends: Ends | None = None) -> Write:
+    """ends: of the image, where places are parts of it."""
+
+    def keypoints(person: Person) -> list[float]:
+        points = rows(person, order, count)
+        if ends is not None:
+            found = points[:, 2] > 0.0
+            points[found, :2] = ends[0] + (ends[1] - ends[0]) * abs(points[found, :2]) / SIZE
+        return points.ravel().tolist()
+
     def write(path: Path, film: Film) -> Path:
         folder = path / "film"
         folder.mkdir()
         for number, frame in enumerate(film):
-            people = [{"pose_keypoints_2d": rows(person, order, count).ravel().tolist()} for person in frame]
+            people = [{key: keypoints(person)} for person in frame]
             dump(folder / f"film_{number:012}_keypoints.json", {"version": 1.3, "people": people})
         return folder
 
@@ -130,19 +145,66 @@ def mmpose_of_images(path: Path, film: Film) -> Path:
     return folder
 
 
-def mediapipe(wrapped: bool) -> Write:
+def alphapose_by_image(key: str, points_key: str) -> Write:
     def write(path: Path, film: Film) -> Path:
-        frames: list[Any] = []
-        for frame in film:
-            landmark_rows = rows(frame[0], MEDIAPIPE, 33) if frame else np.zeros((0, 3))
-            landmarks = [
-                {"x": x / SIZE[0], "y": y / SIZE[1], "z": 0.1, "visibility": visibility}
-                for x, y, visibility in landmark_rows
-            ]
-            frames.append({"landmarks": landmarks} if wrapped else landmarks or None)
+        images = {
+            f"{number}.jpg": {"version": "AlphaPose v0.3", key: [
+                {points_key: rows(person, OPENPOSE_COCO, 18).ravel().tolist()} for person in frame
+            ]}
+            for number, frame in enumerate(film)
+        }  # fmt: skip
+        return dump(path / "alphapose-results-forms.json", images)
+
+    return write
+
+
+def landmarks(person: Person, visible: bool = True) -> list[dict[str, float]]:
+    return [
+        {"x": x / SIZE[0], "y": y / SIZE[1], "z": 0.1} | ({"visibility": visibility} if visible else {})
+        for x, y, visibility in rows(person, MEDIAPIPE, 33)
+    ]
+
+
+# A frame of a person in each of MediaPipe's forms.
+MEDIAPIPE_FORMS: dict[str, Callable[[list[dict[str, float]]], object]] = {
+    "": lambda points: points or None,
+    ", wrapped": lambda points: {"landmarks": points},
+    ", message": lambda points: {"landmark": points},
+    ", web": lambda points: {"poseLandmarks": points},
+    ", people": lambda points: {"landmarks": [points] if points else [], "worldLandmarks": []},
+    ", people alone": lambda points: [points] if points else [],
+    ", people's messages": lambda points: {"pose_landmarks": [{"landmark": points}] if points else []},
+}
+
+
+def mediapipe(form: str, visible: bool = True) -> Write:
+    def write(path: Path, film: Film) -> Path:
+        frames = [MEDIAPIPE_FORMS[form](landmarks(frame[0], visible) if frame else []) for frame in film]
         return dump(path / "landmarks.json", frames)
 
     return write
+
+
+def yolo(path: Path, film: Film) -> Path:
+    def person_entry(person: Person) -> dict[str, Any]:
+        x, y, visible = rows(person, COCO, 17).T.tolist()
+        return {"name": "person", "class": 0, "keypoints": {"x": x, "y": y, "visible": visible}}
+
+    return dump(path / "yolo.json", [[person_entry(person) for person in frame] for frame in film])
+
+
+def yolo_labels(path: Path, film: Film) -> Path:
+    """As `save_txt` writes them: no file where nobody is."""
+    folder = path / "labels"
+    folder.mkdir()
+    for number, frame in enumerate(film, start=1):
+        lines = [
+            " ".join(map(str, [0, 0.5, 0.5, 0.2, 0.6, *(rows(person, COCO, 17) / (*SIZE, 1.0)).ravel()]))
+            for person in frame
+        ]
+        if lines:
+            (folder / f"film_{number}.txt").write_text("\n".join(lines) + "\n")
+    return folder
 
 
 def npz(kind: str) -> Write:
@@ -161,30 +223,50 @@ def npz(kind: str) -> Write:
 
 FORMATS: dict[str, tuple[Write, dict[str, int]]] = {
     "OpenPose BODY_25": (openpose(BODY_25, 25), BODY_25),
+    "OpenPose BODY_25B": (openpose(BODY_25B, 25), BODY_25B),
     "OpenPose COCO": (openpose(OPENPOSE_COCO, 18), OPENPOSE_COCO),
+    "OpenPose, older key": (openpose(OPENPOSE_COCO, 18, "pose_keypoints"), OPENPOSE_COCO),
+    "OpenPose, from 0 to 1": (openpose(BODY_25, 25, ends=(0.0, 1.0)), BODY_25),
+    "OpenPose, from -1 to 1": (openpose(BODY_25, 25, ends=(-1.0, 1.0)), BODY_25),
     "OpenPose's form of HALPE": (openpose(HALPE, 26), HALPE),
     "AlphaPose COCO": (alphapose(COCO, 17), COCO),
     "AlphaPose HALPE": (alphapose(HALPE, 26), HALPE),
     "AlphaPose 133": (alphapose(WHOLE_BODY, 133), WHOLE_BODY),
     "AlphaPose 136": (alphapose(HALPE, 136), HALPE),
+    "AlphaPose, cmu": (alphapose_by_image("bodies", "joints"), OPENPOSE_COCO),
+    "AlphaPose, open": (alphapose_by_image("people", "pose_keypoints_2d"), OPENPOSE_COCO),
     "MMPose demo": (mmpose(COCO, 17, "demo"), COCO),
     "MMPose film": (mmpose(HALPE, 26, "film"), HALPE),
     "MMPose list": (mmpose(WHOLE_BODY, 133, "list"), WHOLE_BODY),
     "MMPose with names": (mmpose_with_names, OUR_ORDER),
     "MMPose of images": (mmpose_of_images, COCO),
-    "MediaPipe": (mediapipe(False), MEDIAPIPE),
-    "MediaPipe, wrapped": (mediapipe(True), MEDIAPIPE),
+    "MMPose H36M": (mmpose(H36M, 17, "film"), H36M),
+    **{f"MediaPipe{form}": (mediapipe(form), MEDIAPIPE) for form in MEDIAPIPE_FORMS},
+    "YOLO": (yolo, COCO),
+    "YOLO labels": (yolo_labels, COCO),
     "npz, points": (npz("points"), OUR_ORDER),
     "npz, places": (npz("places"), OUR_ORDER),
 }
 
 
+# A person who stands with the arms away from the body, to our left in the image: x and y of each point, from -1 to 1.
+_LEFT_HALF = {
+    "ear": (0.1, -0.94), "shoulder": (0.24, -0.66), "elbow": (0.5, -0.34), "wrist": (0.9, -0.1), "hip": (0.14, -0.06),
+    "knee": (0.18, 0.44), "ankle": (0.2, 0.9), "heel": (0.16, 0.98), "toe": (0.34, 1.0),
+}  # fmt: skip
+FIGURE = np.zeros((len(POINTS), 2))
+for row, name in enumerate(POINTS):
+    side, _, part = name.partition("_")
+    x, y = _LEFT_HALF.get(part, (0.0, -1.0))
+    FIGURE[row] = -x if side == "right" else x, y
+
+
 def film_of(seed: int, frames: int, place: float = 400.0) -> list[Person]:
     """A person of about 300 px around x = `place`, who moves a little; each point is missing here and there."""
     random = np.random.default_rng(seed)
-    figure = random.uniform((place - 70.0, 250.0), (place + 70.0, 550.0), (len(POINTS), 2))
+    figure = (place, 400.0) + (70.0, 150.0) * FIGURE + random.uniform(-3.0, 3.0, FIGURE.shape)
     places = figure + np.cumsum(random.uniform(-6.0, 6.0, (frames, 1, 2)), axis=0)
-    places = places + random.uniform(-4.0, 4.0, places.shape)
+    places = places + random.uniform(-2.0, 2.0, places.shape)
     confidence = random.uniform(0.2, 1.0, (frames, len(POINTS))) * (random.random((frames, len(POINTS))) > 0.15)
     return list(np.concatenate([places, confidence[..., None]], axis=-1))
 

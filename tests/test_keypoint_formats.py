@@ -11,10 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from keypoint_files import (
     BODY_25,
+    BODY_25B,
     COCO,
     FORMATS,
     HALPE,
     MAX_LOST_FRAMES,
+    MEDIAPIPE,
     RATE,
     SIZE,
     Film,
@@ -25,13 +27,19 @@ from keypoint_files import (
     folder,
     instance,
     loaded,
+    mediapipe,
     points,
     result,
     rows,
 )
 
+from tasks.kick import Kick
+from tasks.motions import angles
 from tasks.pose import formats
+from tasks.pose.point_orders import ORDERS, order_of
 from tasks.pose.points import POINTS
+from tasks.pose.reconstruction import angles_of
+from tasks.pose.synthetic_film import camera_around, detected, points_of
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -41,18 +49,95 @@ def test_what_was_written_is_read_in_every_format(name: str, seed: int, gone: se
     write, order = FORMATS[name]
     people = [None if frame in gone else person for frame, person in enumerate(film_of(seed, 10))]
     read = loaded(write, [[] if person is None else [person] for person in people])
-    np.testing.assert_allclose(points(read.keypoints), expected(people, order), rtol=1e-12, atol=0.0)
+    np.testing.assert_allclose(points(read.keypoints), expected(people, order), rtol=1e-12, atol=1e-9)
     assert read.keypoints.rate == RATE
     assert read.keypoints.size == SIZE
     assert (read.people, read.crossed) == (1, 0)
 
 
-@pytest.mark.parametrize("name", [name for name in FORMATS if not name.startswith("AlphaPose")])
+@pytest.mark.parametrize("name", [name for name in FORMATS if not name.startswith(("AlphaPose", "YOLO labels"))])
 def test_frames_without_anyone_are_kept_at_both_ends(name: str) -> None:
     write, order = FORMATS[name]
     people = [None, None, *film_of(1, 3), None]
     read = loaded(write, [[] if person is None else [person] for person in people])
     np.testing.assert_allclose(points(read.keypoints), expected(people, order), rtol=1e-12)
+
+
+def test_landmarks_whose_visibility_is_not_told_are_sure() -> None:
+    people = film_of(33, 4)
+    for person in people:
+        person[:, 2] = 0.5
+    read = loaded(mediapipe("", visible=False), [[person] for person in people]).keypoints
+    np.testing.assert_allclose(read.places, np.array(people)[..., :2], rtol=1e-12)
+    assert (read.confidence == 1.0).all()
+
+
+def test_landmarks_in_pixels_are_not_multiplied_by_the_size(tmp_path: Path) -> None:
+    people = film_of(34, 4)
+    frames = [[{"x": x, "y": y, "visibility": seen} for x, y, seen in rows(person, MEDIAPIPE, 33)] for person in people]
+    read = formats.load(dump(tmp_path / "landmarks.json", frames), RATE, SIZE)
+    np.testing.assert_array_equal(points(read.keypoints), expected(list(people), MEDIAPIPE))
+    assert read.notes == ("33 points a person, read as mediapipe",)
+
+
+@pytest.mark.parametrize(
+    ("name", "note"),
+    [
+        ("OpenPose BODY_25", "25 points a person, read as body_25"),
+        ("OpenPose BODY_25B", "25 points a person, read as body_25b"),
+        ("AlphaPose COCO", "17 points a person, read as coco"),
+        ("MMPose H36M", "17 points a person, read as h36m"),
+        ("OpenPose, from 0 to 1", "places are parts of the image, from 0 to 1"),
+        ("OpenPose, from -1 to 1", "places are parts of the image, from -1 to 1"),
+    ],
+)
+def test_what_a_file_was_taken_for_is_said(name: str, note: str) -> None:
+    assert note in loaded(FORMATS[name][0], [[person] for person in film_of(35, 5)]).notes
+
+
+@pytest.mark.parametrize("name", ["body_25", "body_25b", "coco", "h36m"])
+def test_orders_of_one_length_are_told_apart_from_any_side(name: str) -> None:
+    """A kick seen by 12 cameras around, of the points that both orders have."""
+    count, names = ORDERS[name]
+    kick = Kick.standard()
+    motion = angles.motion(**angles_of(kick.reference.states, kick.scene.bodies[0], kick.scene.dt))
+    for seed in range(12):
+        random = np.random.default_rng(seed)
+        places = points_of(motion)
+        film = detected(random, camera_around(random, places), places, 100.0)
+        order = {point: row for row, point in enumerate(names) if point in POINTS}
+        people = [
+            rows(np.column_stack([np.nan_to_num(frame), sure]), order, count)
+            for frame, sure in zip(film.places, film.confidence, strict=True)
+        ]
+        assert order_of(people)[0] == name
+
+
+def test_the_order_of_points_can_be_said(tmp_path: Path) -> None:
+    people = film_of(36, 4)
+    path = FORMATS["OpenPose BODY_25B"][0](tmp_path, [[person] for person in people])
+    for name in ("body_25b", "body_25"):
+        read = formats.load(path, RATE, points=name)
+        assert read.notes == (f"25 points a person, read as {name}",)
+        right = np.array_equal(points(read.keypoints), expected(list(people), BODY_25B), equal_nan=True)
+        assert right == (name == "body_25b")
+
+
+@pytest.mark.parametrize("label", ["frame_{:04}_rendered1.png", "{}_of_12.jpg", "cam2-take3-{:06}.png"])
+def test_the_number_of_an_image_is_the_one_that_changes(tmp_path: Path, label: str) -> None:
+    people = film_of(37, 12)
+    written = [result(label.format(number), person) for number, person in enumerate(people, 5)]
+    read = formats.load(dump(tmp_path / "results.json", written), RATE)
+    np.testing.assert_array_equal(points(read.keypoints), expected(list(people)))
+
+
+def test_a_file_that_is_no_frame_is_left_out_and_named(tmp_path: Path) -> None:
+    people = film_of(38, 12)
+    path = FORMATS["OpenPose BODY_25"][0](tmp_path, [[person] for person in people])
+    dump(path / "camera_2.json", {"size": [1280, 720]})
+    read = formats.load(path, RATE)
+    np.testing.assert_array_equal(points(read.keypoints), expected(list(people), BODY_25))
+    assert "left out, as named otherwise than the frames: camera_2.json" in read.notes
 
 
 @settings(max_examples=20)
@@ -127,11 +212,11 @@ def test_points_that_a_file_does_not_name_are_not_found(tmp_path: Path) -> None:
 
 
 def test_arguments_win_over_the_rate_and_the_size_of_a_file(tmp_path: Path) -> None:
-    np.savez(tmp_path / "a.npz", points=np.array(film_of(9, 4)), names=POINTS, rate=25.0, size=(640, 480))
+    np.savez(tmp_path / "a.npz", points=np.array(film_of(9, 4)), names=POINTS, rate=25.0, size=(640, 680))
     from_file = formats.load(tmp_path / "a.npz").keypoints
-    assert (from_file.rate, from_file.size) == (25.0, (640.0, 480.0))
-    from_arguments = formats.load(tmp_path / "a.npz", rate=50.0, size=(320.0, 240.0)).keypoints
-    assert (from_arguments.rate, from_arguments.size) == (50.0, (320.0, 240.0))
+    assert (from_file.rate, from_file.size) == (25.0, (640.0, 680.0))
+    from_arguments = formats.load(tmp_path / "a.npz", rate=50.0, size=(1280.0, 720.0)).keypoints
+    assert (from_arguments.rate, from_arguments.size) == (50.0, (1280.0, 720.0))
 
 
 def test_what_a_file_is_shows_in_its_content(tmp_path: Path) -> None:

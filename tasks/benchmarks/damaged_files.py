@@ -143,7 +143,7 @@ def kinds() -> dict[str, FileKind]:
         "motion, npz": FileKind(_write_motion, "motion.npz", angles.load),
         "humanoid, MJCF": FileKind(partial(_copy, HUMANOID), HUMANOID.name, humanoid),
         "keypoints, npz": FileKind(_write_keypoints, "film.npz", formats.load),
-        "keypoints, JSON": FileKind(_write_detections, "results.json", partial(formats.load, rate=30.0)),
+        "keypoints, JSON": FileKind(_write_detections, "results.json", partial(formats.load, rate=30.0, points="coco")),
         "camera": FileKind(_write_camera, "camera.json", camera.load),
         "key poses": FileKind(partial(_copy, key_poses.FILE), key_poses.FILE.name, key_poses.load),
         "kept kick, arrays": FileKind(

@@ -20,7 +20,7 @@ from larp_model.errors import InputError
 from larp_model.names import meant, require_file
 from tasks.pose import safe_pickle
 from tasks.pose.camera import Camera
-from tasks.pose.formats import ORDERS
+from tasks.pose.point_orders import ORDERS
 from tasks.pose.points import POINTS, Keypoints
 
 # Frames a second, of all films; how many cameras there are.
@@ -33,9 +33,9 @@ UNUSABLE = {"gBR_sBM_cAll_d04_mBR0_ch01": 4, "gJB_sBM_cAll_d07_mJB3_ch05": 6}
 FIELDS = {"size": (2,), "matrix": (3, 3), "rotation": (3,), "translation": (3,), "distortions": (5,)}
 # Rotation from its world, y up, to ours.
 TO_OUR_AXES = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-_COUNT = len(ORDERS[17])
-_OUR_ROWS = [row for row, name in enumerate(POINTS) if name in ORDERS[17]]
-_AIST_ROWS = [ORDERS[17].index(POINTS[row]) for row in _OUR_ROWS]
+_COUNT, _NAMES = ORDERS["coco"]
+_OUR_ROWS = [row for row, name in enumerate(POINTS) if name in _NAMES]
+_AIST_ROWS = [_NAMES.index(POINTS[row]) for row in _OUR_ROWS]
 _ANKLE_ROWS = [POINTS.index("left_ankle"), POINTS.index("right_ankle")]
 
 

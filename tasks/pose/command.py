@@ -23,7 +23,7 @@ from tasks.pose.camera import Camera
 from tasks.pose.checkpoint import Progress, fingerprint
 from tasks.pose.lift import Lifted
 from tasks.pose.picture import pose_picture
-from tasks.pose.points import Keypoints
+from tasks.pose.points import Keypoints, require_inside
 from tasks.pose.reconstruction import DT, Reconstruction, angles_of, cut, overlay_of, reconstruct
 from tasks.presets import PresetName
 from viewer import write_overlay
@@ -39,7 +39,9 @@ MAX_SLIP = 0.12
 def camera_of(path: Path | None, film: Keypoints) -> tuple[Camera, bool]:
     """Return the camera of a JSON file, or one held by hand, and whether its position is known."""
     if path is not None:
-        return cameras.load(path, film.size)
+        lens, position_known = cameras.load(path, film.size)
+        require_inside(film, 2.0 * lens.centre, "the film")
+        return lens, position_known
     if film.size is None:
         raise InputError("size is not known, but the images' width and height are needed, or a camera file with them")
     return cameras.handheld(cameras.focal_length(cameras.FIELD_OF_VIEW, film.size[0]), film.size), False
@@ -129,6 +131,7 @@ def main(
     camera: Path | None = None,
     size: tuple[float, float] | None = None,
     person: int | None = None,
+    points: str | None = None,
     height: float | None = None,
     dynamics: DynamicsName = "larp",
     preset: PresetName = "balanced",
@@ -140,12 +143,13 @@ def main(
     """Motion in 3D from the 2D keypoints of a film. A run that was cut off goes on where it was.
 
     Args:
-        keypoints: of OpenPose (a folder), AlphaPose, MMPose or MediaPipe (JSON), or npz.
+        keypoints: of OpenPose (a folder), AlphaPose, MMPose, MediaPipe or YOLO (JSON, or a folder of labels), or npz.
         rate: frames a second of the film, where the file does not say.
         camera: JSON file of the camera, which stands still: field_of_view (degrees) or focal (px), size, and, where it
             is known, position and look_at; a phone's by default, its height and tilt estimated.
         size: width and height of the images (px), where neither file says.
         person: which of several, in order of appearance from 0; the one who is seen best by default.
+        points: order of a person's points, such as coco, body_25 or body_25b, where it is not recognised.
         height: of the person (m); where it is not known, it is estimated by a camera whose position is, and taken to be
             1.75 m by any other.
         dynamics: the planner's model: larp or mujoco.
@@ -159,11 +163,13 @@ def main(
     if height is not None and not HEIGHTS[0] <= height <= HEIGHTS[1]:
         raise InputError(f"height is {height:g}, but must be from {HEIGHTS[0]:g} to {HEIGHTS[1]:g} m")
     require_writable(out, "out")
-    loaded = formats.load(keypoints, rate, size, person)
+    loaded = formats.load(keypoints, rate, size, person, points)
     film = cut(loaded.keypoints)
     lens, position_known = camera_of(camera, film)
     prepare_jax()
     teller = Teller(quiet, json)
+    for note in loaded.notes:
+        teller(note)
     if loaded.crossed:
         teller(f"another person is before or behind this one in {loaded.crossed} frames: look at them in pose.png")
     camera_inputs = lens.focal, lens.centre, lens.turn, lens.position, position_known
@@ -176,7 +182,11 @@ def main(
         result = reconstruct(film, lifted, dynamics, physical.PRESETS[preset], seed, progress, on_step)
     if result.fell:
         teller("the human fell: pose.npz and pose.bvh hold the kinematic start instead, which no physics has seen")
-    summary = summary_of(film, result, slip) | {"people": loaded.people, "crossed": loaded.crossed}
+    summary = summary_of(film, result, slip) | {
+        "people": loaded.people,
+        "crossed": loaded.crossed,
+        "read": loaded.notes,
+    }
     summary |= {"dynamics": dynamics, "preset": preset, "seed": seed}
     write(out, film, result, summary)
     progress.delete()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -63,6 +64,15 @@ class Keypoints:
         """Return the keypoints of the frames from `first` to `last`, both included, as far as they exist."""
         frames = slice(max(first, 0), last + 1)
         return replace(self, places=self.places[frames], confidence=self.confidence[frames])
+
+
+def require_inside(film: Keypoints, size: Sequence[float] | np.ndarray, name: str) -> None:
+    """Raise InputError where most of the detected points lie outside images of this size [px]."""
+    places = film.places[film.detected]
+    outside = np.any((places < 0.0) | (places > np.asarray(size)), axis=-1).mean()
+    if outside > 0.5:
+        share, (width, height) = f"{100.0 * outside:.0f} %", size
+        raise InputError(f"{name} has {share} of its points outside images of a size of {width:g} x {height:g} px")
 
 
 def interpolated(values: np.ndarray, rate: float, times: np.ndarray) -> np.ndarray:
