@@ -81,7 +81,8 @@ def main(
         change: fields of the preset to change: interval=2 replan.0.rounds=3 "verify=(4, 2)".
         dynamics: the planner's model: larp or mujoco.
         reference: a captured kick (BVH, or npz of joint angles) instead of the embedded one.
-        names: JSON object of what the BVH file calls our joints: {"Hips": "pelvis", ...}; known skeletons need none.
+        names: JSON object of what the BVH file calls our joints, {"Hips": "pelvis", ...}, which known skeletons do not
+            need; and of its conventions, {"up": "z", "unit": "inches", "rest": "T-pose"}, where they are not found.
         weights: manifest of weights that correct larp's physics; none by default.
         height: of the human [m].
         mass: of the human [kg]; as heavy as its height squared by default.
@@ -107,6 +108,8 @@ def main(
     with outputs.tell.part("setting up"):
         session = Session(human.task(), dynamics, weights)
         session.planners(plans.preset)
+    if read := session.task.reference.read:
+        outputs.tell(f"{reference} is read with {read}")
     if address is None:
         run_once(session, goal, plans, outputs)
     else:

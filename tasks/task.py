@@ -34,7 +34,7 @@ from tasks import residuals, strike
 from tasks.exploration import exploration_std
 from tasks.models import FLIGHT
 from tasks.motions import references
-from tasks.motions.bvh import names_in
+from tasks.motions.joint_names import names_in
 from tasks.motions.references import Reference
 from tasks.motions.skeleton import Motion
 from tasks.presets import usable

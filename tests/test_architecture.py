@@ -102,6 +102,8 @@ ORDER = [
     "tasks.motions.key_poses",
     "tasks.motions.skeleton",
     "tasks.motions.rest_pose",
+    "tasks.motions.bvh_file",
+    "tasks.motions.joint_names",
     "tasks.motions.bvh",
     "tasks.motions.angles",
     "tasks.motions.tracking",

@@ -233,7 +233,7 @@ def test_the_length_of_the_legs_tells_the_unit(load: Callable[[str], skeleton.Mo
         SWING.replace("Frames: 21", "Frames: 22"),
         *(
             SWING.replace("ROOT ", f"ROOT {prefix}").replace("JOINT ", f"JOINT {prefix}")
-            for prefix in ("Character1_", "Bip01_", "mixamorig:", "a_b_")
+            for prefix in ("Character1_", "Bip01_", "mixamorig:", "a_b_", "Bip01 ", "my own_rig ")
         ),
     ],
 )
@@ -241,6 +241,96 @@ def test_what_writers_do_differently_changes_nothing(load: Callable[[str], skele
     motion, other = load(SWING), load(changed)
     assert other.names == motion.names
     np.testing.assert_array_equal(other.orientations, motion.orientations)
+
+
+BIPED = {"UpLeg": "Thigh", "Leg": "Calf", "Foot": "Foot", "ToeBase": "Toe0", "Arm": "UpperArm", "ForeArm": "Forearm"}
+
+
+def test_names_with_spaces_are_those_of_a_biped(load: Callable[[str], skeleton.Motion]) -> None:
+    content = SWING
+    for joint in NAMES:
+        side = next((side for side in ("Left", "Right") if joint.startswith(side)), "")
+        part = joint.removeprefix(side)
+        own = f"{side[0]} {BIPED.get(part, part)}" if side else {"Hips": "Pelvis"}.get(part, part)
+        content = re.sub(rf"(ROOT|JOINT) {joint}\n", rf"\1 Bip01 {own}\n", content)
+    motion, other = load(SWING), load(content)
+    assert other.names == motion.names
+    np.testing.assert_array_equal(other.orientations, motion.orientations)
+
+
+@pytest.mark.parametrize("counted", [False, True])
+def test_the_offset_of_the_root_counts_where_the_feet_are_nearer_to_the_ground_then(
+    load: Callable[[str], skeleton.Motion], counted: bool
+) -> None:
+    """Some files count the root's positions from its offset, others repeat the offset in them."""
+    moved = SWING.replace("OFFSET 0 0 0\n", "OFFSET 0 95 0\n", 1)
+    if counted:
+        moved = re.sub(r"^0.0 95.0 0.0 ", "0.0 0.0 0.0 ", moved, flags=re.MULTILINE)
+    np.testing.assert_allclose(load(moved).positions, load(SWING).positions, atol=1e-9)
+
+
+@pytest.mark.parametrize("slant", [-20.0, -8.0, 0.0, 8.0, 20.0])
+def test_feet_that_slant_with_the_legs_of_the_t_pose_are_level_where_the_person_stands(
+    load: Callable[[str], skeleton.Motion], slant: float
+) -> None:
+    """The leg with its foot is turned about the axis ahead in the pose without rotations, and back in every frame."""
+    content = text(*swing(20)[1:])
+    for sign in (1, -1):
+        turn = Rotation.from_euler("z", sign * slant, degrees=True)
+        for offset in ((0, -40, 0), (0, -42, 0), (0, -5, 14)):
+            for side in ("Left", "Right")[::sign][:1]:
+                begin = content.index(f"JOINT {side}UpLeg")
+                slanted = " ".join(f"{value:.9f}" for value in turn.apply(offset))
+                leg = content[begin:].replace(f"OFFSET {' '.join(map(str, offset))}\n", f"OFFSET {slanted}\n", 1)
+                content = content[:begin] + leg
+    order = re.findall(r"(?:ROOT|JOINT) (\w+)", content)
+    hierarchy, frames = content.split("Frame Time: 0.01\n")
+    rows = []
+    for line in frames.splitlines():
+        values = np.array(line.split(), float)
+        for sign, side in ((1, "Left"), (-1, "Right")):
+            turn = Rotation.from_euler("z", sign * slant, degrees=True)
+            for joint in ("UpLeg", "Leg", "Foot", "ToeBase"):
+                column = 3 + 3 * order.index(side + joint)
+                own = Rotation.from_euler("ZYX", values[column : column + 3], degrees=True)
+                local = own * turn.inv() if joint == "UpLeg" else turn * own * turn.inv()
+                values[column : column + 3] = local.as_euler("ZYX", degrees=True)
+        rows.append(" ".join(map(str, values)))
+    other = load(hierarchy + "Frame Time: 0.01\n" + "\n".join(rows) + "\n")
+    (_, expected), (_, vectors) = (
+        skeleton.retarget(each, human(), 0.01) for each in (load(text(*swing(20)[1:])), other)
+    )
+    np.testing.assert_allclose(vectors, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("order", "signs", "up"),
+    [
+        ((0, 1, 2), (1, 1, 1), "y"),
+        ((0, 2, 1), (1, -1, 1), "z"),
+        ((1, 2, 0), (1, 1, 1), "x"),
+        ((0, 1, 2), (1, -1, -1), "-y"),
+    ],
+)
+def test_what_a_file_was_taken_for_is_said(
+    load: Callable[[str], skeleton.Motion], order: tuple[int, int, int], signs: tuple[int, int, int], up: str
+) -> None:
+    assert load(axes_exchanged(SWING, order, signs)).read == f"{up} up, in cm, rest pose: T-pose first"
+
+
+def test_conventions_can_be_said_instead(tmp_path: Path) -> None:
+    path = tmp_path / "clip.bvh"
+    path.write_text(SWING)
+    said = bvh.load(path, {"up": "y", "unit": "cm", "rest": "T-pose"})
+    assert said.read == "y up, in cm, rest pose: T-pose"
+    assert len(said.positions) == len(bvh.load(path).positions) + 1
+    for names, message in (
+        ({"up": "w"}, "names: up is 'w', but must be one of y, -y, z"),
+        ({"unit": "mm"}, "has legs 82 units long, but needs 0.6 to 1.2 m in mm"),
+        ({"rest": "A-pose"}, "names: rest is 'A-pose', but must be one of T-pose first, T-pose, arms down, estimated"),
+    ):
+        with pytest.raises(InputError, match=message):
+            bvh.load(path, names)
 
 
 CLASSIC = {"UpLeg": "Hip", "Leg": "Knee", "Foot": "Ankle", "Arm": "Shoulder", "ForeArm": "Elbow", "Hand": "Wrist"}

@@ -17,7 +17,7 @@ from test_bvh import CLIPS, STANDING, swing, text, with_clips
 from larp_model.bodies import human
 from larp_model.errors import InputError
 from larp_model.scene import Scene
-from tasks.motions import angles, bvh, references, rest_pose, skeleton
+from tasks.motions import angles, bvh, joint_names, references, rest_pose, skeleton
 from tasks.motions.skeleton import Motion
 
 LINKS = [human().links[child].name for child, _, _ in human().motors]
@@ -46,7 +46,7 @@ MIXAMO = {name: f"mixamorig:{name}" for name in skeleton.NEEDED}
 OWN = {"Hips": "pelvis", "RightFoot": "r_ankle", "LeftArm": "Hips"}
 
 
-@pytest.mark.parametrize("table", [*bvh.SKELETONS.values(), MIXAMO], ids=[*bvh.SKELETONS, "Mixamo"])
+@pytest.mark.parametrize("table", [*joint_names.SKELETONS.values(), MIXAMO], ids=[*joint_names.SKELETONS, "Mixamo"])
 def test_known_skeletons_move_as_ours_and_are_mirrored(tmp_path: Path, table: dict[str, str]) -> None:
     ours = bvh.load(written(tmp_path, text(*swing(10, "Left"))))
     theirs = bvh.load(written(tmp_path, renamed(text(*swing(10, "Left")), table)))
@@ -59,7 +59,7 @@ def test_ones_own_table_says_what_joints_are_called(tmp_path: Path) -> None:
     ours, path = bvh.load(written(tmp_path, plain)), written(tmp_path, renamed(plain, OWN))
     np.testing.assert_array_equal(retargeted(bvh.load(path, OWN)), retargeted(ours))
     (tmp_path / "names.json").write_text(json.dumps(OWN))
-    assert bvh.names_in(tmp_path / "names.json") == OWN
+    assert joint_names.names_in(tmp_path / "names.json") == OWN
 
 
 @pytest.mark.parametrize(
@@ -86,9 +86,9 @@ def test_a_table_that_is_none_is_refused_in_one_line(tmp_path: Path, content: st
     path = tmp_path / "names.json"
     path.write_text(content)
     with pytest.raises(InputError, match=r"^names: names\.json (is no JSON file|needs an object)"):
-        bvh.names_in(path)
+        joint_names.names_in(path)
     with pytest.raises(InputError, match="no such file"):
-        bvh.names_in(tmp_path / "none.json")
+        joint_names.names_in(tmp_path / "none.json")
 
 
 def test_joints_may_have_positions_too(tmp_path: Path) -> None:

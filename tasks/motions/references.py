@@ -33,12 +33,14 @@ class Reference:
     """Kick that plans stay near to, as the servo-driven human performs it in the ground truth.
 
     states: (T + 1, L, 13) of the whole scene, world frame, the human's pelvis initially above the origin, facing x.
-    controls: (T, J, 3) joint targets [rad]. strike: the step in which the foot first pushes the ball.
+    controls: (T, J, 3) joint targets [rad]. strike: the step in which the foot first pushes the ball. read: what its
+    file was taken for, see `Motion`.
     """
 
     states: np.ndarray
     controls: np.ndarray
     strike: int
+    read: str = ""
 
     @property
     def ball_spot(self) -> np.ndarray:
@@ -172,9 +174,8 @@ def captured(
     if not moving.any():
         raise InputError(f"{path}: the human misses the ball when it performs this kick")
     strike = int(moving.argmax()) - 1
-    return Reference(
-        _launched_along_x(states, strike), np.concatenate([targets_before[:touch_step], targets_after]), strike
-    )
+    all_targets = np.concatenate([targets_before[:touch_step], targets_after])
+    return Reference(_launched_along_x(states, strike), all_targets, strike, motion.read)
 
 
 def require_kick(path: str | Path, motion: Motion, strike: int, dt: float) -> None:

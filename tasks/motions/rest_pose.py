@@ -11,11 +11,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from larp_model.errors import InputError
-from tasks.motions.skeleton import ENDS, SIDES, Motion, bone
+from tasks.motions.skeleton import ENDS, SIDES, Motion, bone, facing
 
 FORWARDS, LEFT, UP = np.eye(3)
 # Fewest frames for an estimate. A limb with a smaller mean bend [rad] gives no hinge axis.
 MIN_FRAMES, MIN_BEND = 10, 0.05
+# Legs of a T-pose are taken for upright within this angle [rad].
+MAX_SLANT = 0.1
 
 
 def rest_orientations(motion: Motion) -> Rotation:
@@ -54,6 +56,27 @@ def rest_orientations(motion: Motion) -> Rotation:
         else:
             rests.append(usual)
     return Rotation.concatenate(rests)
+
+
+def with_level_soles(pose: Motion, motion: Motion, rest: Rotation) -> Rotation:
+    """Return the orientations of a T-pose's n joint frames with feet that are level where they stand in a motion.
+
+    pose: the T-pose, one frame. rest: its joint frames, the person facing x. Where its legs are apart, the feet are
+    level in it, or slanted with the legs: that is taken which makes them roll less in the motion, with the ankle low.
+    """
+    to_forwards, quaternions, rolls = facing(pose, 0), rest.as_quat(), np.zeros(2)
+    for side in SIDES:
+        thigh = to_forwards.apply(bone(pose, f"{side}UpLeg")[0])
+        straightening = aligned((thigh * (0.0, 1.0, 1.0), -UP))
+        if straightening.magnitude() < MAX_SLANT:
+            return rest
+        foot, toe = (motion.names.index(side + name) for name in ("Foot", "ToeBase"))
+        height = motion.path(f"{side}Foot")[:, 2]
+        stance = motion.rotation(f"{side}Foot")[height <= np.quantile(height, 0.25)]
+        for number, frame in enumerate((rest[foot], straightening * rest[foot])):
+            rolls[number] += np.mean(abs((stance * frame.inv()).apply(LEFT)[:, 2]))
+        quaternions[[foot, toe]] = (straightening * rest[[foot, toe]]).as_quat()
+    return Rotation.from_quat(quaternions) if rolls[1] < rolls[0] else rest
 
 
 def branching_frame(motion: Motion, name: str, limbs: str, upwards: np.ndarray) -> Rotation:

@@ -33,7 +33,7 @@ class Motion:
     As in a `Body`, all joint frames are parallel to the world's in the rest pose, in which the person faces x.
     names: of the joints, parents first. parents: (n,), -1 for the root. offsets: (n, 3) from the parent's joint, in
     the parent's frame [m], the root's being zero. rate: frames per second. positions: (T, n, 3) [m]. orientations:
-    (T, n, 4), w, x, y, z.
+    (T, n, 4), w, x, y, z. read: what a file was taken for that does not say it of itself.
     """
 
     names: tuple[str, ...]
@@ -42,6 +42,7 @@ class Motion:
     rate: float
     positions: np.ndarray
     orientations: np.ndarray
+    read: str = ""
 
     def path(self, name: str) -> np.ndarray:
         """Return the positions (T, 3) [m] of a joint."""
