@@ -2,8 +2,8 @@
 
 Every body of the file is one of our links, by its name, or is fixed to the link above it; the hinges between two links
 become one ball joint at their mean position, and welded links get a servo. Links keep their mass, the place of their
-joints, and the length and volume of their geoms; legs and arms are turned to hang, as ours do in rest, and servos and
-bounds of joints are ours, in proportion. What does not fit is refused by name.
+joints, and the length and volume of their geoms; the whole is turned to stand and face x, legs and arms to hang, as
+ours do in rest, and servos and bounds of joints are ours, in proportion. What does not fit is refused by name.
 """
 
 from __future__ import annotations
@@ -41,6 +41,8 @@ HANGING = ("upper_arm", "lower_arm", "thigh", "shin")
 ROUNDEST = 0.1
 # Largest distance of a link's ends from the origin [m].
 FARTHEST = 1000.0
+# Share of a foot's extent by which its middle may be behind the ankle.
+BEHIND = 0.1
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
@@ -62,9 +64,9 @@ class FileJoint(NamedTuple):
 def humanoid(source: str | Path, names: Mapping[str, str] | None = None, name: str = "human") -> Body:
     """Return the humanoid of an MJCF file as a human of 13 links: see above. `bodies.kicking` gives it a ball.
 
-    It stands along z and faces x. names: those of our links in the file, {"left_shin": "calf_l", ...}; by default
-    usual names are recognised. InputError where a link is missing, a joint is no hinge or ball, a geom is
-    neither capsule nor sphere, or bodies are tied by more than joints.
+    It stands and faces x, however it stands or lies in the file. names: those of our links in the file, {"left_shin":
+    "calf_l", ...}; by default usual names are recognised. InputError where a link is missing, a joint is no hinge or
+    ball, a geom is neither capsule nor sphere, bodies are tied by more than joints, or left and right are exchanged.
     """
     path = Path(source)
     require_file("source", path)
@@ -85,7 +87,39 @@ def humanoid(source: str | Path, names: Mapping[str, str] | None = None, name: s
     owners = _owners(path.name, model, body_of_link)
     geometries = [_geometry(path.name, model, data, owners, link) for link in body_of_link]
     joints = _joints(path.name, model, data, body_of_link, usual)
+    feet = {link: geometry for link, geometry in zip(body_of_link, geometries, strict=True) if link.endswith("_foot")}
+    turn = _turn_to_ours(path.name, joints, feet)
+    geometries = [geometry._replace(ends=_turned(turn, geometry.ends)) for geometry in geometries]
+    joints = {link: joint._replace(place=turn.apply(joint.place)) for link, joint in joints.items()}
     return _assembled(usual, geometries, joints)
+
+
+def _turned(turn: Rotation, points: np.ndarray) -> np.ndarray:
+    turned: np.ndarray = turn.apply(points.reshape(-1, 3)).reshape(points.shape)
+    return turned
+
+
+def _turn_to_ours(file: str, joints: Mapping[str, FileJoint], feet: Mapping[str, LinkGeometry]) -> Rotation:
+    """Return the rotation after which a humanoid stands along z and faces x: a right angle's multiple where it is near.
+
+    Left is from the right hip to the left one, up from the hips to the neck. InputError where the feet then point back.
+    """
+    hips = np.array([joints[f"{side}_thigh"].place for side in ("left", "right")])
+    left, up = hips[0] - hips[1], joints["head"].place - hips.mean(axis=0)
+    if not min(np.linalg.norm(left), np.linalg.norm(np.cross(left, up))) > 1e-6:
+        raise InputError(f"source: {file} has hips and neck at one place, or in a line, so that it faces nowhere")
+    turn, _ = Rotation.align_vectors([(0.0, 1.0, 0.0), (0.0, 0.0, 1.0)], [left, up], [np.inf, 1.0])
+    right_angles = np.round(turn.as_matrix())
+    if np.isclose(np.linalg.det(right_angles), 1.0):
+        turn = Rotation.from_matrix(right_angles)
+    ahead, extents = 0.0, 0.0
+    for link, geometry in feet.items():
+        ends = _turned(turn, geometry.ends)[..., 0]
+        ahead += float(ends.mean() - turn.apply(joints[link].place)[0])
+        extents += float(np.ptp(ends) + 2.0 * geometry.radii.max())
+    if ahead < -BEHIND * extents:
+        raise InputError(f"source: {file} has feet that point backwards: its left and right are exchanged")
+    return turn
 
 
 def _named(file: str, model: mujoco.MjModel, links: Sequence[str], names: dict[str, str]) -> dict[str, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -73,6 +74,25 @@ def test_our_own_human_is_read_as_itself_however_its_arms_are_held(pose: str, tm
         np.testing.assert_allclose(one.child_anchor, other.child_anchor, atol=1e-5)
         assert one.motor is not None and other.motor is not None
         assert one.motor.stiffness == pytest.approx(other.motor.stiffness, rel=1e-6)
+
+
+@pytest.mark.parametrize("turn", [(0, 0, 90), (0, 0, 180), (0, 90, 0), (-90, 0, 0), (90, 90, 0), (0, 0, 35)])
+def test_a_humanoid_is_read_alike_wherever_it_faces_and_if_it_lies(
+    turn: tuple[float, float, float], tmp_path: Path
+) -> None:
+    (tmp_path / "turned.xml").write_text(mjcf(human(), {"pelvis": np.radians(turn).tolist()}))
+    found, ours = humanoid(tmp_path / "turned.xml"), human()
+    np.testing.assert_allclose(found.sizes, ours.sizes, rtol=1e-5)
+    for one, other in zip(found.joints, ours.joints, strict=True):
+        np.testing.assert_allclose(one.parent_anchor, other.parent_anchor, atol=1e-5)
+        np.testing.assert_allclose(one.child_anchor, other.child_anchor, atol=1e-5)
+
+
+def test_exchanged_sides_are_refused(tmp_path: Path) -> None:
+    content = re.sub("_(left|right)", lambda side: {"_left": "_right", "_right": "_left"}[side[0]], mjcf(human()))
+    (tmp_path / "exchanged.xml").write_text(content)
+    with pytest.raises(InputError, match="has feet that point backwards: its left and right are exchanged"):
+        humanoid(tmp_path / "exchanged.xml")
 
 
 def test_mujocos_own_humanoid_keeps_mass_bones_and_volume_and_stands() -> None:
