@@ -140,6 +140,7 @@ ORDER = [
     "tasks.pose.people",
     "tasks.pose.detectors",
     "tasks.pose.formats",
+    "tasks.pose.calibration",
     "tasks.pose.camera",
     "tasks.pose.safe_pickle",
     "tasks.pose.aist",

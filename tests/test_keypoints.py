@@ -69,10 +69,10 @@ class TestCamera:
     def test_a_file_says_all_or_leaves_where_it_stands_open(self, tmp_path: Path) -> None:
         path = tmp_path / "camera.json"
         path.write_text(json.dumps({"size": [1000, 800], "field_of_view": 90.0}))
-        lens, known = cameras.load(path)
+        lens, _, _, known = cameras.load(path)
         assert not known and lens.focal == pytest.approx(500.0)
         path.write_text(json.dumps({"focal": 800.0, "position": [4, 0, 2], "look_at": [0, 0, 1], "centre": [490, 410]}))
-        lens, known = cameras.load(path, SIZE)
+        lens, _, _, known = cameras.load(path, SIZE)
         assert known and lens.centre.tolist() == [490.0, 410.0] and lens.position.tolist() == [4.0, 0.0, 2.0]
 
     @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from larp_model.errors import InputError
 from larp_model.names import meant, require_file
 from tasks.pose import safe_pickle
-from tasks.pose.camera import Camera
+from tasks.pose.camera import Camera, Lens
 from tasks.pose.point_orders import ORDERS
 from tasks.pose.points import POINTS, Keypoints
 
@@ -114,36 +114,16 @@ def load(folder: Path, sequence: str, camera: int) -> Dance:
     position = -0.01 * TO_OUR_AXES @ turn.T @ calibration["translation"]
 
     places, confidence = np.full((len(detections), len(POINTS), 2), np.nan), np.zeros((len(detections), len(POINTS)))
-    undistorted_places = undistorted(
-        (detections[:, _AIST_ROWS, :2] - centre) / focal_lengths, calibration["distortions"]
-    )
-    places[:, _OUR_ROWS] = focal * undistorted_places + centre
+    places[:, _OUR_ROWS] = detections[:, _AIST_ROWS, :2]
     confidence[:, _OUR_ROWS] = np.nan_to_num(detections[:, _AIST_ROWS, 2]).clip(0.0, 1.0)
     confidence[np.isnan(places).any(axis=-1)] = 0.0
     places[confidence == 0.0] = np.nan
+    film = Keypoints(places, confidence, RATE, (float(width), float(height)))
     return Dance(
-        Keypoints(places, confidence, RATE, (float(width), float(height))),
+        Lens(focal_lengths, centre, calibration["distortions"]).straightened(film),
         Camera(focal, centre, turn @ TO_OUR_AXES.T, position - ground),
         points - ground,
     )
-
-
-def undistorted(places: np.ndarray, distortion: np.ndarray) -> np.ndarray:
-    """Return normalised image places (*, 2) with the distortion (k1, k2, p1, p2, k3 of OpenCV) removed.
-
-    Uses fixed-point iteration, which converges for the small distortion of these lenses.
-    """
-    k1, k2, p1, p2, k3 = distortion
-    undistorted_places = places
-    for _ in range(20):
-        x, y = undistorted_places[..., 0], undistorted_places[..., 1]
-        square = x**2 + y**2
-        radial = 1.0 + square * (k1 + square * (k2 + square * k3))
-        tangential = np.stack(
-            [2.0 * p1 * x * y + p2 * (square + 2.0 * x**2), p1 * (square + 2.0 * y**2) + 2.0 * p2 * x * y], axis=-1
-        )
-        undistorted_places = (places - tangential) / radial[..., None]
-    return undistorted_places
 
 
 def _camera(path: Path, camera: int) -> dict[str, np.ndarray]:

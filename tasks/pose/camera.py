@@ -1,22 +1,26 @@
-"""Stationary pinhole camera, and its JSON file."""
+"""Stationary pinhole camera, the distortion of its lens, and its file."""
 
 from __future__ import annotations
 
-import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from larp_model.errors import InputError
-from larp_model.names import require_file, require_known
+from larp_model.names import require_known
+from tasks.pose.calibration import fields_of
+from tasks.pose.points import Keypoints
 
 # Horizontal field of view of a phone's camera [degrees] and its height [m], where the file has neither.
 FIELD_OF_VIEW, HANDHELD_HEIGHT = 65.0, 1.4
-FIELDS = ("size", "field_of_view", "focal", "centre", "position", "look_at")
+FIELDS = ("size", "field_of_view", "focal", "centre", "distortion", "position", "look_at", "rotation")
+# Largest error of places whose distortion is removed, in focal lengths; beyond, a lens distorts too much there.
+UNDISTORTED = 1e-3
 
 
 @jax.tree_util.register_dataclass
@@ -75,35 +79,77 @@ def handheld(focal: float, size: tuple[float, float]) -> Camera:
     return looking_at(position, position + np.array([1.0, 0.0, 0.0]), focal, size)
 
 
-def load(path: str | Path, size: tuple[float, float] | None = None) -> tuple[Camera, bool]:
-    """Return the camera of a JSON file, and whether the file gives its position.
+def undistorted(places: np.ndarray, distortion: np.ndarray) -> np.ndarray:
+    """Return normalised image places (*, 2) with the distortion (k1, k2, p1, p2, k3 of OpenCV) removed.
 
-    {"size": [width, height] in px, "field_of_view": degrees or "focal": px, "centre": [x, y] in px, "position": [x, y,
-    z] and "look_at": [x, y, z] in m}: size may be left out where the keypoints have it (argument `size`), the centre
-    where it is the image's, position and look_at where they are to be estimated.
+    Uses fixed-point iteration, which converges for small distortion; NaN where it does not.
     """
-    path = Path(path)
-    require_file("camera", path)
-    fields = _fields(path)
-    width, height = _image_size(fields, path.name, size)
-    focal = _focal_length(fields, path.name, width)
-    camera = _placed(fields, path.name, focal, (width, height))
-    if "centre" in fields:
-        camera = Camera(focal, _numbers(fields, "centre", 2), camera.turn, camera.position)
-    return camera, "position" in fields
+    result = places
+    with np.errstate(all="ignore"):
+        for _ in range(20):
+            radial, tangential = _bent(result, distortion)
+            result = (places - tangential) / radial
+        radial, tangential = _bent(result, distortion)
+        error = np.abs(result * radial + tangential - places).max(axis=-1, keepdims=True)
+    return np.where(error < UNDISTORTED, result, np.nan)
 
 
-def _fields(path: Path) -> dict[str, Any]:
-    """Return the content of a camera's file; an InputError names a field that is not one of `FIELDS`."""
-    try:
-        fields = json.loads(path.read_bytes())
-    except ValueError:
-        raise InputError(f"camera: {path.name} is no JSON file") from None
-    if not isinstance(fields, dict):
-        raise InputError(f"camera: {path.name} needs an object with some of {', '.join(FIELDS)}")
+def _bent(places: np.ndarray, distortion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the factor (*, 1) and the shift (*, 2) by which OpenCV's distortion moves normalised image places."""
+    k1, k2, p1, p2, k3 = distortion
+    x, y = places[..., 0], places[..., 1]
+    square = x**2 + y**2
+    radial = 1.0 + square * (k1 + square * (k2 + square * k3))
+    shift = [2.0 * p1 * x * y + p2 * (square + 2.0 * x**2), p1 * (square + 2.0 * y**2) + 2.0 * p2 * x * y]
+    return radial[..., None], np.stack(shift, axis=-1)
+
+
+class Lens(NamedTuple):
+    """Lens of a camera: focal lengths (2,) and centre (2,) [px], distortion k1, k2, p1, p2, k3 of OpenCV."""
+
+    focal: np.ndarray
+    centre: np.ndarray
+    distortion: np.ndarray
+
+    def straightened(self, film: Keypoints) -> Keypoints:
+        """Return keypoints as a pinhole camera of the first focal length sees them; lost where distorted too much."""
+        if self.focal[0] == self.focal[1] and not self.distortion.any():
+            return film
+        places = self.focal[0] * undistorted((film.places - self.centre) / self.focal, self.distortion) + self.centre
+        return replace(film, places=places, confidence=np.where(np.isnan(places[..., 0]), 0.0, film.confidence))
+
+
+class LoadedCamera(NamedTuple):
+    """Camera of a file: as a pinhole, its lens, its images' size [px], and whether its position is known."""
+
+    camera: Camera
+    lens: Lens
+    size: tuple[float, float]
+    position_known: bool
+
+
+def load(path: str | Path, size: tuple[float, float] | None = None) -> LoadedCamera:
+    """Return the camera of a file: a calibration in one of the forms of `calibration`, or a JSON object.
+
+    {"size": [width, height] in px, "field_of_view": degrees or "focal": px, one number or along x and y, "centre": [x,
+    y] in px, "distortion": [k1, k2, p1, p2] or with k3 as OpenCV has them, "position": [x, y, z] in m, and "look_at":
+    [x, y, z] in m or "rotation": a rotation vector in rad, from the world, z up, to the camera's axes}: size may be
+    left out where the keypoints have it (argument `size`), the centre where it is the image's, position and where it
+    looks where they are to be estimated.
+    """
+    file_name, fields = fields_of(path)
     for name in fields:
-        require_known(f"camera: a field of {path.name}", name, FIELDS)
-    return fields
+        require_known(f"camera: a field of {file_name}", name, FIELDS)
+    size = _image_size(fields, file_name, size)
+    focal = _focal_lengths(fields, file_name, size[0])
+    camera = _placed(fields, file_name, float(focal[0]), size)
+    if "centre" in fields:
+        camera = replace(camera, centre=_numbers(fields, "centre", 2))
+    distortion = np.zeros(5)
+    if "distortion" in fields:
+        count = 5 if isinstance(fields["distortion"], list) and len(fields["distortion"]) == 5 else 4
+        distortion[:count] = _numbers(fields, "distortion", count)
+    return LoadedCamera(camera, Lens(focal, camera.centre, distortion), size, "position" in fields)
 
 
 def _numbers(fields: dict[str, Any], name: str, count: int) -> np.ndarray:
@@ -129,26 +175,33 @@ def _image_size(fields: dict[str, Any], file_name: str, default: tuple[float, fl
     return size
 
 
-def _focal_length(fields: dict[str, Any], file_name: str, width: float) -> float:
-    """Return the focal length [px], from that of the file or the field of view; width: of the images [px]."""
+def _focal_lengths(fields: dict[str, Any], file_name: str, width: float) -> np.ndarray:
+    """Return the focal lengths (2,) [px], from those of the file or the field of view; width: of the images [px]."""
     if "focal" in fields and "field_of_view" in fields:
         raise InputError(f"camera: {file_name} has both focal and field_of_view, but needs one of them")
     if "focal" not in fields:
         (angle,) = _numbers(fields, "field_of_view", 1) if "field_of_view" in fields else (FIELD_OF_VIEW,)
-        return focal_length(angle, width)
-    focal: float = _numbers(fields, "focal", 1)[0]
-    if not focal > 0.0:
-        raise InputError(f"camera: focal is {focal:g}, but must be above 0")
+        return np.full(2, focal_length(angle, width))
+    focal = np.broadcast_to(_numbers(fields, "focal", 2 if isinstance(fields["focal"], list) else 1), 2)
+    if not (focal > 0.0).all():
+        raise InputError(f"camera: focal is {fields['focal']}, but must be above 0")
     return focal
 
 
 def _placed(fields: dict[str, Any], file_name: str, focal: float, size: tuple[float, float]) -> Camera:
     """Return the camera at the file's position, or one held by hand where it has none."""
-    if ("position" in fields) != ("look_at" in fields):
-        raise InputError(f"camera: {file_name} has one of position and look_at, but needs both or neither")
-    if "position" not in fields:
+    ways = [name for name in ("look_at", "rotation") if name in fields]
+    if len(ways) != ("position" in fields):
+        found = ", ".join(name for name in ("position", *ways) if name in fields)
+        raise InputError(
+            f"camera: {file_name} has {found}, but needs both or neither: position, and one of look_at and rotation"
+        )
+    if not ways:
         return handheld(focal, size)
-    position, target = _numbers(fields, "position", 3), _numbers(fields, "look_at", 3)
+    position = _numbers(fields, "position", 3)
     if not position[2] > 0.0:
         raise InputError(f"camera: position is {position.tolist()}, but must be above the ground, z = 0")
-    return looking_at(position, target, focal, size)
+    if ways == ["look_at"]:
+        return looking_at(position, _numbers(fields, "look_at", 3), focal, size)
+    turn = Rotation.from_rotvec(_numbers(fields, "rotation", 3)).as_matrix()
+    return Camera(focal, 0.5 * np.asarray(size, float), turn, position)

@@ -36,15 +36,18 @@ MAX_MEDIAN_ERROR = 0.03
 MAX_SLIP = 0.12
 
 
-def camera_of(path: Path | None, film: Keypoints) -> tuple[Camera, bool]:
-    """Return the camera of a JSON file, or one held by hand, and whether its position is known."""
+def camera_of(path: Path | None, film: Keypoints) -> tuple[Keypoints, Camera, bool]:
+    """Return the film without a lens' distortion, its camera, and whether the camera's position is known.
+
+    path: of a camera's file; without one, the camera is held by hand.
+    """
     if path is not None:
-        lens, position_known = cameras.load(path, film.size)
-        require_inside(film, 2.0 * lens.centre, "the film")
-        return lens, position_known
+        loaded = cameras.load(path, film.size)
+        require_inside(film, loaded.size, "the film")
+        return loaded.lens.straightened(film), loaded.camera, loaded.position_known
     if film.size is None:
         raise InputError("size is not known, but the images' width and height are needed, or a camera file with them")
-    return cameras.handheld(cameras.focal_length(cameras.FIELD_OF_VIEW, film.size[0]), film.size), False
+    return film, cameras.handheld(cameras.focal_length(cameras.FIELD_OF_VIEW, film.size[0]), film.size), False
 
 
 def lifted_of(
@@ -145,8 +148,10 @@ def main(
     Args:
         keypoints: of OpenPose (a folder), AlphaPose, MMPose, MediaPipe or YOLO (JSON, or a folder of labels), or npz.
         rate: frames a second of the film, where the file does not say.
-        camera: JSON file of the camera, which stands still: field_of_view (degrees) or focal (px), size, and, where it
-            is known, position and look_at; a phone's by default, its height and tilt estimated.
+        camera: file of the camera, which stands still: a calibration of OpenCV (YAML, JSON), EasyMocap, Pose2Sim (TOML)
+            or COLMAP, as FILE:NAME where it has several; or JSON with field_of_view (degrees) or focal (px), size,
+            centre, distortion and, where they are known, position and look_at or rotation; a phone's by default, its
+            height and tilt estimated.
         size: width and height of the images (px), where neither file says.
         person: which of several, in order of appearance from 0; the one who is seen best by default.
         points: order of a person's points, such as coco, body_25 or body_25b, where it is not recognised.
@@ -164,8 +169,7 @@ def main(
         raise InputError(f"height is {height:g}, but must be from {HEIGHTS[0]:g} to {HEIGHTS[1]:g} m")
     require_writable(out, "out")
     loaded = formats.load(keypoints, rate, size, person, points)
-    film = cut(loaded.keypoints)
-    lens, position_known = camera_of(camera, film)
+    film, lens, position_known = camera_of(camera, cut(loaded.keypoints))
     prepare_jax()
     teller = Teller(quiet, json)
     for note in loaded.notes:
