@@ -18,7 +18,7 @@ from larp_model.errors import InputError
 from larp_model.scene import Scene
 from tasks.benchmarks import reference as benchmark
 from tasks.motions import angles, bvh, skeleton
-from tasks.motions.references import captured
+from tasks.motions.references import MOST_BEYOND, captured
 
 CLIPS = Path(__file__).parents[2] / "shared" / "mocap"
 with_clips = pytest.mark.skipif(not CLIPS.is_dir(), reason="no captured clips in ../shared/mocap")
@@ -316,6 +316,18 @@ def test_what_a_file_was_taken_for_is_said(
     load: Callable[[str], skeleton.Motion], order: tuple[int, int, int], signs: tuple[int, int, int], up: str
 ) -> None:
     assert load(axes_exchanged(SWING, order, signs)).read == f"{up} up, in cm, rest pose: T-pose first"
+
+
+def test_a_leg_that_is_turned_in_the_rest_pose_shows_in_a_knee_beyond_its_bounds(
+    load: Callable[[str], skeleton.Motion],
+) -> None:
+    bent = [frame | {"RightLeg": (0.0, 0.0, 40.0)} for frame in swing(20)[1:]]
+    beyond = {
+        turn: skeleton.beyond_bounds(load(text({"RightUpLeg": (0.0, turn, 0.0)}, *bent)), human(), 0.01)
+        for turn in (0.0, 180.0)
+    }
+    assert max(beyond[0.0].values()) < 0.1
+    assert beyond[180.0]["right_shin"] > MOST_BEYOND
 
 
 def test_conventions_can_be_said_instead(tmp_path: Path) -> None:

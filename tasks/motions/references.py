@@ -24,6 +24,9 @@ from tasks.motions.tracking import Tracker
 
 # Steps around the strike in which a captured kick may hit its ball.
 STRIKE_STEPS = 10
+# Joints of captured kicks are at most 0.1 rad beyond a human's bounds, in the mean; those of a skeleton that is
+# misunderstood far more.
+MOST_BEYOND = 0.3
 # Least height of the hips above the lower foot at the strike, as a share of the rest pose's.
 MIN_HIP_HEIGHT = 0.5
 
@@ -175,7 +178,15 @@ def captured(
         raise InputError(f"{path}: the human misses the ball when it performs this kick")
     strike = int(moving.argmax()) - 1
     all_targets = np.concatenate([targets_before[:touch_step], targets_after])
-    return Reference(_launched_along_x(states, strike), all_targets, strike, motion.read)
+    read = "; ".join(filter(None, (motion.read, _unlike_a_human(clip, scene.dt))))
+    return Reference(_launched_along_x(states, strike), all_targets, strike, read)
+
+
+def _unlike_a_human(clip: Motion, dt: float) -> str:
+    """Return which joints bend far beyond a human's bounds, as a sentence; an empty one if none does."""
+    beyond = skeleton.beyond_bounds(clip, bodies.human(), dt)
+    joints = [f"{name.replace('_', ' ')} by {mean:.1f} rad" for name, mean in beyond.items() if mean > MOST_BEYOND]
+    return f"joints bend beyond a human's, in the mean {', '.join(joints)}: is this its rest pose?" if joints else ""
 
 
 def require_kick(path: str | Path, motion: Motion, strike: int, dt: float) -> None:

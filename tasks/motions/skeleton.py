@@ -137,6 +137,19 @@ def retarget(motion: Motion, body: Body, dt: float) -> tuple[np.ndarray, np.ndar
     Returns the root's orientation (T', 4), w, x, y, z, and the joints' rotation vectors (T', J, 3) [rad], within the
     motors' bounds.
     """
+    root, vectors = _unbounded(motion, body, dt)
+    return root, np.clip(vectors, *body.limits)
+
+
+def beyond_bounds(motion: Motion, body: Body, dt: float) -> dict[str, float]:
+    """Return by how much joints bend beyond a human's bounds [rad], by child link: the mean over the motion."""
+    _, vectors = _unbounded(motion, body, dt)
+    excess = np.linalg.norm(vectors - np.clip(vectors, *body.limits), axis=-1).mean(axis=0)
+    return {body.links[child].name: float(mean) for (child, _, _), mean in zip(body.motors, excess, strict=True)}
+
+
+def _unbounded(motion: Motion, body: Body, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the results of `retarget`, with joints as far beyond the motors' bounds as the motion takes them."""
     if not dt > 0.0 or len(motion.positions) < 2:
         raise InputError(
             f"dt is {dt!r}, the motion has {len(motion.positions)} frames; needs dt above 0 and two frames"
@@ -144,10 +157,10 @@ def retarget(motion: Motion, body: Body, dt: float) -> tuple[np.ndarray, np.ndar
     frames = len(motion.positions)
     times, step_times = np.arange(frames) / motion.rate, sampled_times(frames, motion.rate, dt)
     rotations = [Slerp(times, _link_rotation(motion, link.name))(step_times) for link in body.links]
-    controls = np.stack(
+    vectors = np.stack(
         [(rotations[joint.parent].inv() * rotations[child]).as_rotvec() for child, joint, _ in body.motors], axis=1
     )
-    return rotations[0].as_quat(scalar_first=True), np.clip(controls, *body.limits)
+    return rotations[0].as_quat(scalar_first=True), vectors
 
 
 def _link_rotation(motion: Motion, link: str) -> Rotation:
