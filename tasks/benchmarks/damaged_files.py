@@ -105,9 +105,30 @@ def _write_detections(folder: Path) -> None:
     (folder / "results.json").write_text(json.dumps(people))
 
 
+def _write_labels(folder: Path) -> None:
+    random = np.random.default_rng(0)
+    for frame in range(4):
+        numbers = [0, 0.5, 0.5, 0.3, 0.8, *random.uniform(0.1, 0.9, 51)]
+        _write_text(folder / f"film_{frame}.txt", " ".join(f"{number:.5f}" for number in numbers) + "\n")
+
+
 def _write_camera(folder: Path) -> None:
     fields = {"size": [1280, 720], "field_of_view": 60.0, "position": [0.0, -4.0, 1.5], "look_at": [0.0, 0.0, 1.0]}
     (folder / "camera.json").write_text(json.dumps(fields))
+
+
+def _write_opencv_lens(folder: Path) -> None:
+    matrix = "!!opencv-matrix {rows: 3, cols: 3, dt: d, data: [900., 0., 640., 0., 900., 360., 0., 0., 1.]}"
+    distortion = "!!opencv-matrix {rows: 1, cols: 5, dt: d, data: [-0.1, 0.05, 0.001, 0.002, 0.01]}"
+    text = f"%YAML:1.0\n---\nimage_width: 1280\nimage_height: 720\ncamera_matrix: {matrix}\n"
+    _write_text(folder / "lens.yml", f"{text}distortion_coefficients: {distortion}\n")
+
+
+def _write_pose2sim_camera(folder: Path) -> None:
+    matrix = "[[900.0, 0.0, 640.0], [0.0, 900.0, 360.0], [0.0, 0.0, 1.0]]"
+    lens = f'name = "a"\nsize = [1280.0, 720.0]\nmatrix = {matrix}\ndistortions = [-0.1, 0.05, 0.001, 0.002]\n'
+    place = "rotation = [1.2, -1.2, 1.2]\ntranslation = [0.0, 1.4, 4.0]\nfisheye = false\n"
+    _write_text(folder / "calib.toml", f"[a]\n{lens}{place}")
 
 
 def _write_kept_kick(folder: Path, kick: Kick) -> None:
@@ -144,7 +165,14 @@ def kinds() -> dict[str, FileKind]:
         "humanoid, MJCF": FileKind(partial(_copy, HUMANOID), HUMANOID.name, humanoid),
         "keypoints, npz": FileKind(_write_keypoints, "film.npz", formats.load),
         "keypoints, JSON": FileKind(_write_detections, "results.json", partial(formats.load, rate=30.0, points="coco")),
-        "camera": FileKind(_write_camera, "camera.json", camera.load),
+        "keypoints, labels": FileKind(
+            _write_labels,
+            "film_1.txt",
+            lambda path: formats.load(path.parent, rate=30.0, size=(1280.0, 720.0), points="coco"),
+        ),
+        "camera, JSON": FileKind(_write_camera, "camera.json", camera.load),
+        "camera, YAML": FileKind(_write_opencv_lens, "lens.yml", camera.load),
+        "camera, TOML": FileKind(_write_pose2sim_camera, "calib.toml", camera.load),
         "key poses": FileKind(partial(_copy, key_poses.FILE), key_poses.FILE.name, key_poses.load),
         "kept kick, arrays": FileKind(
             partial(_write_kept_kick, kick=kick), "kick.npz", lambda path: load_recording(kick, path.parent)
@@ -231,7 +259,7 @@ def is_finite(value: Any, depth: int = 0) -> bool:
 
 
 # Where not a number says that nothing was detected; and what reads any arrays.
-ANY_NUMBERS = ("keypoints, npz", "keypoints, JSON", "pickled arrays", "kept kick, arrays")
+ANY_NUMBERS = ("keypoints, npz", "keypoints, JSON", "keypoints, labels", "pickled arrays", "kept kick, arrays")
 
 
 def read_damaged(name: str, count: int, seed: int) -> report.Row:
