@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from larp_model.errors import InputError
 from tasks.pose import camera as cameras
+from tasks.pose.command import camera_of
 from tasks.pose.points import POINTS, Keypoints
 
 SIZE = (1920.0, 1080.0)
@@ -126,6 +127,31 @@ def test_a_camera_sees_the_same_points_in_every_form(tmp_path: Path, form: str) 
     assert abs(straightened - film.places).max() > 3.0
     if placed:
         np.testing.assert_allclose(camera.project(points), pinhole.project(points), atol=1e-6)
+
+
+@pytest.mark.parametrize("degrees", [90, 180, 270])
+def test_images_that_were_turned_show_the_same_points(tmp_path: Path, degrees: int) -> None:
+    points, (width, height) = persons_points(), SIZE
+    x, y = np.moveaxis(seen(points, DISTORTION), -1, 0)
+    turned_places = {90: (height - y, x), 180: (width - x, height - y), 270: (y, width - x)}[degrees]
+    loaded = cameras.load(tmp_path / ours(tmp_path)).turned(degrees)
+    assert loaded.size == (SIZE if degrees == 180 else SIZE[::-1])
+    film = Keypoints(np.stack(turned_places, axis=-1), np.ones(points.shape[:2]), 30.0, loaded.size)
+    np.testing.assert_allclose(loaded.lens.straightened(film).places, loaded.camera.project(points), atol=0.01)
+
+
+def test_a_camera_that_is_held_by_hand_stays_upright_when_its_images_are_turned(tmp_path: Path) -> None:
+    loaded = cameras.load(tmp_path / opencv_yaml(tmp_path))
+    np.testing.assert_array_equal(loaded.turned(90).camera.turn, loaded.camera.turn)
+    assert loaded.turned(90).camera.focal == FOCAL[1]
+
+
+def test_images_of_another_format_than_the_cameras_ask_how_they_were_turned(tmp_path: Path) -> None:
+    film = Keypoints(np.full((1, len(POINTS), 2), 500.0), np.ones((1, len(POINTS))), 30.0, (1080.0, 1920.0))
+    path = tmp_path / ours(tmp_path)
+    with pytest.raises(InputError, match=r"turned is 0, but images of 1080 x 1920 px need 90 or 270 for camera\.json"):
+        camera_of(path, 0, film)
+    assert camera_of(path, 90, film)[2]
 
 
 def test_points_that_a_lens_cannot_show_are_lost() -> None:

@@ -127,6 +127,27 @@ class LoadedCamera(NamedTuple):
     size: tuple[float, float]
     position_known: bool
 
+    def turned(self, degrees: int) -> LoadedCamera:
+        """Return the camera of images that were turned clockwise by a multiple of 90 degrees.
+
+        A camera whose position is not known stays upright.
+        """
+        result = self
+        for _ in range(degrees // 90 % 4):
+            result = result._turned_once()
+        return result
+
+    def _turned_once(self) -> LoadedCamera:
+        # What lies at x to the right and y down lies at -y to the right and x down afterwards.
+        width, height = self.size
+        quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        k1, k2, p1, p2, k3 = self.lens.distortion
+        centre = np.array([height - self.lens.centre[1], self.lens.centre[0]])
+        lens = Lens(self.lens.focal[::-1], centre, np.array([k1, k2, p2, -p1, k3]))
+        turn = quarter @ self.camera.turn if self.position_known else self.camera.turn
+        camera = replace(self.camera, focal=float(lens.focal[0]), centre=centre, turn=turn)
+        return LoadedCamera(camera, lens, (height, width), self.position_known)
+
 
 def load(path: str | Path, size: tuple[float, float] | None = None) -> LoadedCamera:
     """Return the camera of a file: a calibration in one of the forms of `calibration`, or a JSON object.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json as text
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -36,13 +36,19 @@ MAX_MEDIAN_ERROR = 0.03
 MAX_SLIP = 0.12
 
 
-def camera_of(path: Path | None, film: Keypoints) -> tuple[Keypoints, Camera, bool]:
+def camera_of(path: Path | None, turned: int, film: Keypoints) -> tuple[Keypoints, Camera, bool]:
     """Return the film without a lens' distortion, its camera, and whether the camera's position is known.
 
-    path: of a camera's file; without one, the camera is held by hand.
+    path: of a camera's file; without one, the camera is held by hand. turned: see `main`.
     """
     if path is not None:
-        loaded = cameras.load(path, film.size)
+        own_size = film.size if film.size is None or turned % 180 == 0 else (film.size[1], film.size[0])
+        loaded = cameras.load(path, own_size).turned(turned)
+        if film.size == (loaded.size[1], loaded.size[0]) != loaded.size:
+            (width, height), needed = film.size, "0 or 180" if turned % 180 else "90 or 270"
+            raise InputError(
+                f"turned is {turned}, but images of {width:g} x {height:g} px need {needed} for {path.name}"
+            )
         require_inside(film, loaded.size, "the film")
         return loaded.lens.straightened(film), loaded.camera, loaded.position_known
     if film.size is None:
@@ -132,6 +138,7 @@ def main(
     keypoints: Annotated[Path, tyro.conf.Positional],
     rate: float | None = None,
     camera: Path | None = None,
+    turned: Literal[0, 90, 180, 270] = 0,
     size: tuple[float, float] | None = None,
     person: int | None = None,
     points: str | None = None,
@@ -152,6 +159,7 @@ def main(
             or COLMAP, as FILE:NAME where it has several; or JSON with field_of_view (degrees) or focal (px), size,
             centre, distortion and, where they are known, position and look_at or rotation; a phone's by default, its
             height and tilt estimated.
+        turned: degrees clockwise by which the images were turned after the camera was calibrated.
         size: width and height of the images (px), where neither file says.
         person: which of several, in order of appearance from 0; the one who is seen best by default.
         points: order of a person's points, such as coco, body_25 or body_25b, where it is not recognised.
@@ -169,7 +177,7 @@ def main(
         raise InputError(f"height is {height:g}, but must be from {HEIGHTS[0]:g} to {HEIGHTS[1]:g} m")
     require_writable(out, "out")
     loaded = formats.load(keypoints, rate, size, person, points)
-    film, lens, position_known = camera_of(camera, cut(loaded.keypoints))
+    film, lens, position_known = camera_of(camera, turned, cut(loaded.keypoints))
     prepare_jax()
     teller = Teller(quiet, json)
     for note in loaded.notes:
