@@ -16,9 +16,10 @@ from larp_model.physics import kinematics
 from larp_model.scene import Body
 from tasks.episodes.any_motion import any_episodes, states_in_motion, with_planted_foot
 from tasks.episodes.people import BUILD, HEIGHT, MASS, VARIED, random_people
-from tasks.motions import references, styles
+from tasks.motions import angles, references, styles
 from tasks.motions.details import in_detail
 from tasks.motions.references import clearance
+from tasks.pose.reconstruction import angles_of
 
 SCENE = human_and_ball()
 FULL = human_and_ball(detail="full")
@@ -183,3 +184,13 @@ def test_the_same_seed_draws_the_same_episodes(reference: references.Reference) 
     one, other = (any_episodes(SCENE, reference, 4, 9, 8)[0] for _ in range(2))
     np.testing.assert_array_equal(one.states, other.states)
     np.testing.assert_array_equal(one.controls, other.controls)
+
+
+def test_the_ball_of_a_captured_kick_lies_where_only_the_kicking_foot_reaches(reference: references.Reference) -> None:
+    """Our own kick, captured: where its foot would push hardest, the standing leg is."""
+    motion = angles.motion(**angles_of(reference.states, HUMAN, SCENE.dt))
+    captured = references.captured(motion, SCENE)
+    states, _ = Truth(SCENE).rollout(captured.states[None, 0], captured.controls[None])
+    speed = np.linalg.norm(states[0, :, -1, packed.VELOCITY], axis=-1)
+    assert speed[: captured.strike - 1].max() < 0.01
+    assert speed[captured.strike + 5] > 11.0

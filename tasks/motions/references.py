@@ -266,28 +266,54 @@ def _position_weights(scene: Scene, steps: int, strike: int) -> np.ndarray:
 
 
 def _ball_spot(path: str | Path, scene: Scene, states: np.ndarray, strike: int) -> tuple[np.ndarray, int]:
-    """Return the ball's position (3,) [m] just ahead of the right foot, and the step near the strike of the touch."""
+    """Return the ball's position (3,) [m] just ahead of the right foot, and the step near the strike of the touch.
+
+    It is the hardest push at a place that no other link reaches before.
+    """
     human, radius = scene.human, scene.ball.links[0].radius
     foot = human.links[human.link("right_foot")]
     foot_states = states[:, scene.index(human.name, "right_foot")]
     height = foot_states[:, 2] - radius
     speed = np.linalg.norm(foot_states[:, packed.VELOCITY][:, :2], axis=-1)
-    reach = radius + foot.radius
     # The foot pushes along the line of centres, which its height tilts out of the horizontal.
-    push_speed = speed * np.sqrt(np.maximum(1.0 - (height / reach) ** 2, 0.0))
+    push_speed = speed * np.sqrt(np.maximum(1.0 - (height / (radius + foot.radius)) ** 2, 0.0))
     push_speed[abs(np.arange(len(foot_states)) - strike) > STRIKE_STEPS] = 0.0
-    touch_step = int(push_speed.argmax())
-    if not push_speed[touch_step] > 0.0:
+    steps = [int(step) for step in np.argsort(-push_speed, kind="stable") if push_speed[step] > 0.0]
+    if not steps:
         raise InputError(f"{path}: the foot passes {height[strike]:.2f} m above the centre of a ball, and hits none")
+    spots = [_spot_ahead(foot, radius, foot_states[step]) for step in steps]
+    for spot, step in zip(spots, steps, strict=True):
+        if _room(scene, states[: step + 1], spot) > 0.0:
+            return spot, step
+    raise InputError(f"{path}: the standing leg is where the foot strikes, so that no ball can lie there")
 
-    forwards = np.array([*foot_states[touch_step, packed.VELOCITY][:2], 0.0]) / speed[touch_step]
-    rotation = Rotation.from_quat(foot_states[touch_step, packed.ORIENTATION], scalar_first=True)
+
+def _spot_ahead(foot: Link, radius: float, state: np.ndarray) -> np.ndarray:
+    """Return the position (3,) [m] of a ball of this radius on the ground that a foot in a state (13,) is to touch."""
+    velocity, reach = state[packed.VELOCITY][:2], radius + foot.radius
+    forwards = np.array([*velocity, 0.0]) / np.linalg.norm(velocity)
+    rotation = Rotation.from_quat(state[packed.ORIENTATION], scalar_first=True)
     axis_points = np.linspace(-0.5, 0.5, 21)[:, None] * foot.length * rotation.apply(foot.axis)
     # Points of the foot's axis, from the ball's centre below them; moved ahead, it is out of reach of all of them.
-    offsets = axis_points + np.array([0.0, 0.0, height[touch_step]])
+    offsets = axis_points + np.array([0.0, 0.0, state[2] - radius])
     ahead = offsets @ forwards
     squared_aside = np.sum(offsets**2, axis=-1) - ahead**2
     distance = np.max(
         ahead + np.sqrt(np.maximum(reach**2 - squared_aside, 0.0)), where=squared_aside < reach**2, initial=0.0
     )
-    return np.array([*(foot_states[touch_step, :2] + distance * forwards[:2]), radius]), touch_step
+    return np.array([*(state[:2] + distance * forwards[:2]), radius])
+
+
+def _room(scene: Scene, states: np.ndarray, spot: np.ndarray) -> float:
+    """Return the least distance [m] of a ball at a place (3,) from links in states (T, L, 13), the right foot apart."""
+    human, least = scene.human, np.inf
+    for link in human.links:
+        if link.name == "right_foot":
+            continue
+        own = states[:, scene.index(human.name, link.name)]
+        axis = Rotation.from_quat(own[:, packed.ORIENTATION], scalar_first=True).apply(link.axis)
+        offset = spot - own[:, packed.POSITION]
+        along = np.clip(np.sum(offset * axis, axis=-1), -0.5 * link.length, 0.5 * link.length)
+        distance = np.linalg.norm(offset - along[:, None] * axis, axis=-1) - link.radius
+        least = min(least, float(distance.min()) - scene.ball.links[0].radius)
+    return least
