@@ -22,7 +22,8 @@ from tasks.pose import aist, lift, metrics, safe_pickle
 from tasks.pose import figure as figures
 from tasks.pose.camera import Camera, looking_at
 from tasks.pose.figure import SHARED
-from tasks.pose.points import POINTS, Keypoints
+from tasks.pose.points import POINTS
+from tasks.pose.views import Views
 
 PROTOCOLS = (2, 3, 4, 5)
 SEQUENCE, VIDEO, OTHER = "gBR_sBM_cAll_d06_mBR4_ch06", "gBR_sBM_c06_d06_mBR4_ch06", "gLH_sFM_cAll_d18_mLH0_ch15"
@@ -357,9 +358,9 @@ def test_the_benchmark_judges_dances_as_what_truly_happened_beside_the_figures_o
     stands = figures.Pose(place, np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, figure.joints, 3)))
     proportions = np.zeros(SHARED)
 
-    def laid(keypoints: Keypoints, camera: Camera) -> lift.Lifted:
-        assert len(keypoints) == count and np.isfinite(keypoints.places[:, KNOWN]).all()
-        return lift.Lifted(stands, proportions, camera, 0.0)
+    def laid(views: Views) -> lift.Lifted:
+        assert len(views) == count and np.isfinite(views.places[..., KNOWN, :]).all()
+        return lift.Lifted(stands, proportions, views.cameras, 0.0)
 
     monkeypatch.setattr(lift, "lift", laid)
     monkeypatch.chdir(tmp_path)

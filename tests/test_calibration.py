@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from larp_model.errors import InputError
 from tasks.pose import camera as cameras
-from tasks.pose.command import camera_of
+from tasks.pose import sources
 from tasks.pose.points import POINTS, Keypoints
 
 SIZE = (1920.0, 1080.0)
@@ -147,11 +147,12 @@ def test_a_camera_that_is_held_by_hand_stays_upright_when_its_images_are_turned(
 
 
 def test_images_of_another_format_than_the_cameras_ask_how_they_were_turned(tmp_path: Path) -> None:
-    film = Keypoints(np.full((1, len(POINTS), 2), 500.0), np.ones((1, len(POINTS))), 30.0, (1080.0, 1920.0))
-    path = tmp_path / ours(tmp_path)
+    path, film = tmp_path / ours(tmp_path), tmp_path / "film.npz"
+    places = np.full((12, len(POINTS), 2), 500.0)
+    np.savez(film, names=np.array(POINTS), places=places, rate=30.0, size=np.array([1080.0, 1920.0]))
     with pytest.raises(InputError, match=r"turned is 0, but images of 1080 x 1920 px need 90 or 270 for camera\.json"):
-        camera_of(path, 0, film)
-    assert camera_of(path, 90, film)[2]
+        sources.load((film,), camera_files=(path,))
+    assert sources.load((film,), camera_files=(path,), turned=90).position_known
 
 
 def test_points_that_a_lens_cannot_show_are_lost() -> None:

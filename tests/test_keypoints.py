@@ -23,6 +23,7 @@ from tasks.pose import lift, metrics, physical, synthetic_film
 from tasks.pose.banded import Banded
 from tasks.pose.figure import SHARED, Figure, Pose
 from tasks.pose.points import POINTS, Keypoints
+from tasks.pose.views import Views
 
 SIZE = (1000.0, 800.0)
 seeds = st.integers(0, 2**31)
@@ -49,6 +50,11 @@ def film_of(
     random = np.random.default_rng(seed)
     lens = synthetic_film.camera_around(random, points)
     return synthetic_film.detected(random, lens, points, 50.0, noise), lens
+
+
+def held_by_hand(film: Keypoints, lens: cameras.Camera) -> Views:
+    """The film by a camera of which only the lens is known."""
+    return Views((film,), (cameras.handheld(lens.focal, synthetic_film.SIZE),))
 
 
 class TestCamera:
@@ -218,7 +224,7 @@ class TestFilms:
 
     def test_a_figure_laid_over_a_kick_is_near_the_true_one(self, kick: np.ndarray) -> None:
         film, lens = film_of(kick, 11)
-        lifted = lift.lift(film, lens)
+        lifted = lift.lift(Views((film,), (lens,)))
         found = figures.figure().all_points(lifted.pose, lifted.proportions)
         errors = metrics.position_errors(found, kick)
         assert errors["mpjpe_g_mm"] < 120.0 and errors["mpjpe_pa_mm"] < 60.0
@@ -227,11 +233,11 @@ class TestFilms:
     def test_a_person_of_known_height_is_as_large_and_as_far_whatever_the_image(self, kick: np.ndarray) -> None:
         small = 1.6 / 1.75 * kick
         film, lens = film_of(small, 17)
-        lifted = lift.lift(film, cameras.handheld(lens.focal, synthetic_film.SIZE), position_known=False, height=1.6)
+        lifted = lift.lift(held_by_hand(film, lens), position_known=False, height=1.6)
         found = figures.figure().all_points(lifted.pose, lifted.proportions)
         far, true = (
             np.linalg.norm(metrics.pelvis(points)[:, 0] - np.asarray(by.position), axis=1).mean()
-            for points, by in ((found, lifted.camera), (small, lens))
+            for points, by in ((found, lifted.cameras[0]), (small, lens))
         )
         assert figures.figure().height(lifted.proportions) == pytest.approx(1.6, rel=0.01)
         assert far == pytest.approx(true, rel=0.04)
@@ -245,18 +251,18 @@ class TestFilms:
             caplog.clear()
             with jax.log_compiles():
                 jax.jit(lambda x: x + 1.0)(1.0)
-                lift.lift(film.cut(0, frames - 1), lens)
+                lift.lift(Views((film.cut(0, frames - 1),), (lens,)))
             said.append(sum("Compiling" in each for each in caplog.messages))
         assert said[1] == 1 <= said[0], "it is only the function above that is compiled anew"
 
     def test_a_camera_of_which_only_the_lens_is_known_is_found_with_the_motion(self, kick: np.ndarray) -> None:
         film, lens = film_of(kick, 13)
-        lifted = lift.lift(film, cameras.handheld(lens.focal, synthetic_film.SIZE), position_known=False)
+        lifted = lift.lift(held_by_hand(film, lens), position_known=False)
         found = figures.figure().all_points(lifted.pose, lifted.proportions)
         errors = metrics.position_errors(found, kick)
-        tilt, found_tilt = (float(np.arcsin(-np.asarray(each.turn)[2, 2])) for each in (lens, lifted.camera))
+        tilt, found_tilt = (float(np.arcsin(-np.asarray(each.turn)[2, 2])) for each in (lens, lifted.cameras[0]))
         assert errors["mpjpe_pa_mm"] < 50.0 and lifted.error < 8.0
         assert tilt > 0.3 and found_tilt == pytest.approx(tilt, abs=0.2), (
             "the person stands on the ground, not above it"
         )
-        assert lifted.camera.position[2] == pytest.approx(lens.position[2], rel=0.35)
+        assert lifted.cameras[0].position[2] == pytest.approx(lens.position[2], rel=0.35)

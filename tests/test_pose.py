@@ -21,37 +21,44 @@ from tasks.motions import angles, bvh
 from tasks.motions.references import embedded
 from tasks.pose import command, lift, metrics, physical, reconstruction, synthetic_film
 from tasks.pose import figure as figures
+from tasks.pose.camera import Camera
 from tasks.pose.checkpoint import Progress
 from tasks.pose.figure import SHARED
 from tasks.pose.points import POINTS, Keypoints, interpolated
+from tasks.pose.views import Views
 
 
 @pytest.fixture(scope="module")
 def film() -> dict[str, Any]:
-    """Keypoints of the swing and the strike of the embedded kick, its camera, and where its points truly are."""
+    """Keypoints of the swing and the strike of the embedded kick, two cameras, and where its points truly are."""
     reference, figure = embedded(human_and_ball()), figures.figure()
     points = physical.BodyPoints(figure.body, figure, np.zeros(SHARED))
     states = reference.states[: reference.strike + 20 : 2, : len(figure.body.links)]
     true = np.asarray(points.points(states.astype(np.float32)), float)
     random = np.random.default_rng(4)
     lens = synthetic_film.camera_around(random, true)
-    return {"keypoints": synthetic_film.detected(random, lens, true, 50.0), "lens": lens, "true": true}
+    film = {"keypoints": synthetic_film.detected(random, lens, true, 50.0), "lens": lens, "true": true}
+    second = synthetic_film.camera_around(random, true)
+    return film | {"second keypoints": synthetic_film.detected(random, second, true, 50.0), "second": second}
 
 
-def written(folder: Path, keypoints: Keypoints, **changed: Any) -> Path:
+def camera_file(path: Path, lens: Camera) -> Path:
+    at = (lens.position + 3.0 * lens.turn[2]).tolist()
+    path.write_text(json.dumps({"focal": lens.focal, "position": lens.position.tolist(), "look_at": at}))
+    return path
+
+
+def written(folder: Path, keypoints: Keypoints, name: str = "film", **changed: Any) -> Path:
     fields: dict[str, Any] = {"places": keypoints.places, "confidence": keypoints.confidence, "names": np.array(POINTS)}
     fields |= {"rate": keypoints.rate, "size": np.array(keypoints.size)} | changed
-    np.savez(folder / "film.npz", **{name: value for name, value in fields.items() if value is not None})
-    return folder / "film.npz"
+    np.savez(folder / f"{name}.npz", **{field: value for field, value in fields.items() if value is not None})
+    return folder / f"{name}.npz"
 
 
 @pytest.mark.slow
 def test_a_film_becomes_a_motion_in_mujoco_and_a_reference(film: dict[str, Any], tmp_path: Path) -> None:
-    lens, out = film["lens"], tmp_path / "pose"
-    at = (lens.position + 3.0 * lens.turn[2]).tolist()
-    camera = tmp_path / "camera.json"
-    camera.write_text(json.dumps({"focal": lens.focal, "position": lens.position.tolist(), "look_at": at}))
-    command.main(written(tmp_path, film["keypoints"]), camera=camera, preset="fast", out=out, quiet=True)
+    out, camera = tmp_path / "pose", camera_file(tmp_path / "camera.json", film["lens"])
+    command.main((written(tmp_path, film["keypoints"]),), cameras=(camera,), preset="fast", out=out, quiet=True)
     summary = json.loads((out / "summary.json").read_text())
     assert not summary["camera_seems_to_move"] and summary["slip_m_s"] < command.MAX_SLIP
     assert not summary["fell"] and summary["error_px"] < 25.0 and summary["candidates"] > 100
@@ -68,14 +75,14 @@ def test_a_film_becomes_a_motion_in_mujoco_and_a_reference(film: dict[str, Any],
 
 
 @pytest.mark.slow
-def test_a_reconstruction_that_was_cut_off_goes_on_as_if_it_had_not_been(
+def test_a_reconstruction_of_two_films_that_was_cut_off_goes_on_as_if_it_had_not_been(
     film: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(reconstruction, "SAVE_INTERVAL", 0.0)
     whole, again = tmp_path / "whole", tmp_path / "again"
-    short = film["keypoints"].cut(0, 19)
-    keypoints = written(tmp_path, short)
-    command.main(keypoints, preset="fast", out=whole, quiet=True)
+    keypoints = tuple(written(tmp_path, film[name].cut(0, 19), name) for name in ("keypoints", "second keypoints"))
+    cameras = tuple(camera_file(tmp_path / f"{name}.json", film[name]) for name in ("lens", "second"))
+    command.main(keypoints, cameras=cameras, preset="fast", out=whole, quiet=True)
 
     def interrupted(step: int, steps: int) -> None:
         if step >= 17:
@@ -84,16 +91,16 @@ def test_a_reconstruction_that_was_cut_off_goes_on_as_if_it_had_not_been(
     with monkeypatch.context() as changed:
         changed.setattr(Teller, "bar", lambda self, what: nullcontext(interrupted))
         with pytest.raises(KeyboardInterrupt):
-            command.main(keypoints, preset="fast", out=again, quiet=True)
+            command.main(keypoints, cameras=cameras, preset="fast", out=again, quiet=True)
     assert [path.name for path in again.iterdir()] == ["unfinished.npz"]
     capsys.readouterr()
-    command.main(keypoints, preset="fast", out=again)
+    command.main(keypoints, cameras=cameras, preset="fast", out=again)
     assert "17 steps done" in capsys.readouterr().out
     assert sorted(path.name for path in again.iterdir()) == sorted(path.name for path in whole.iterdir())
     one, other = (angles.load(folder / "pose.npz") for folder in (whole, again))
     np.testing.assert_allclose(other.path("Hips"), one.path("Hips"), atol=0.01)
     first, second = (json.loads((folder / "summary.json").read_text()) for folder in (whole, again))
-    assert first["candidates"] == second["candidates"]
+    assert first["candidates"] == second["candidates"] and first["films"] == len(first["cameras_m"]) == 2
 
 
 @pytest.mark.parametrize("moves", [False, True])
@@ -112,13 +119,13 @@ def test_a_film_by_a_camera_that_follows_the_person_is_told_of(
 
     monkeypatch.setattr(command, "reconstruct", enough)
     with pytest.raises(KeyboardInterrupt):
-        command.main(written(tmp_path, seen), camera=camera, out=tmp_path / "pose")
+        command.main((written(tmp_path, seen),), cameras=(camera,), out=tmp_path / "pose")
     assert ("does the camera move" in capsys.readouterr().out) == moves
 
 
 def test_what_was_kept_of_another_film_or_is_damaged_is_of_no_use(film: dict[str, Any], tmp_path: Path) -> None:
     path = tmp_path / "unfinished.npz"
-    found = lift.Lifted(figures.Pose(*(np.zeros(2),) * 3), np.zeros(11), film["lens"], 1.0)
+    found = lift.Lifted(figures.Pose(*(np.zeros(2),) * 3), np.zeros(11), (film["lens"],), 1.0)
     Progress(path, "one").save(found)
     again = Progress(path, "one")
     assert again.lifted is not None and again.lifted.error == 1.0 and again.checkpoint is None
@@ -138,7 +145,7 @@ def test_frames_at_the_ends_in_which_nobody_is_seen_are_left_out(film: dict[str,
     whole = film["keypoints"]
     hidden = Keypoints(whole.places.copy(), whole.confidence.copy(), whole.rate, whole.size)
     hidden.confidence[:3], hidden.confidence[-5:] = 0.0, 0.0
-    left = reconstruction.cut(hidden)
+    (left,) = reconstruction.cut(Views((hidden,), (film["lens"],))).films
     assert len(left) <= len(whole) - 8
     np.testing.assert_array_equal(left.places[-1], whole.places[len(whole) - 6])
 
@@ -158,7 +165,7 @@ def test_who_moves_steadily_does_so_at_another_rate_too_and_rests_where_the_moti
         ({"rate": None}, [], "rate"),
         ({"size": None}, [], "size is not known"),
         ({"confidence": np.zeros((30, len(POINTS)))}, [], "film.npz"),
-        ({}, ["--camera", "nowhere.json"], "nowhere.json"),
+        ({}, ["--cameras", "nowhere.json"], "nowhere.json"),
         ({}, ["--person", "4"], "person"),
         ({}, ["--height", "3"], "height is 3, but must be from 1.3 to 2.2 m"),
     ],
@@ -225,4 +232,4 @@ def test_a_benchmark_that_makes_no_sense_is_refused(arguments: dict[str, Any], s
 
 def test_too_few_frames_are_refused(film: dict[str, Any]) -> None:
     with pytest.raises(InputError, match="6 or more points in 5 frames, but need 10"):
-        reconstruction.cut(film["keypoints"].cut(0, 4))
+        reconstruction.cut(Views((film["keypoints"].cut(0, 4),), (film["lens"],)))

@@ -25,10 +25,11 @@ from tasks.motions.references import embedded, motion_of
 from tasks.pose import aist as dances
 from tasks.pose import figure as figures
 from tasks.pose import lift, metrics, physical, synthetic_film
-from tasks.pose.camera import Camera
+from tasks.pose.camera import places_in_all
 from tasks.pose.figure import SHARED
-from tasks.pose.points import Keypoints, interpolated
+from tasks.pose.points import interpolated
 from tasks.pose.reconstruction import frames_with_person, reconstruct
+from tasks.pose.views import Views
 from tasks.presets import PresetName
 
 # Frame rate of a synthetic film [1/s], and the share of it before a kick's strike.
@@ -126,12 +127,11 @@ class FilmSettings:
 class Film(NamedTuple):
     """A film to reconstruct, with its ground truth.
 
-    clip: name. lens: the camera, which is known. true: points (T, P, 3) [m], NaN where they are not known.
+    clip: name. views: by cameras that are known. true: points (T, P, 3) [m], NaN where they are not known.
     """
 
     clip: str
-    keypoints: Keypoints
-    lens: Camera
+    views: Views
     true: np.ndarray
 
 
@@ -163,14 +163,14 @@ def film_of_clip(clip: Path | None, camera: int, seconds: float, seed: int) -> F
     random = np.random.default_rng((seed, camera))
     lens = synthetic_film.camera_around(random, true)
     name = "embedded" if clip is None else clip.stem
-    return Film(name, synthetic_film.detected(random, lens, true, RATE), lens, true)
+    return Film(name, Views((synthetic_film.detected(random, lens, true, RATE),), (lens,)), true)
 
 
 def film_of_dance(folder: Path, sequence: str, camera: int, seconds: float) -> Film:
     """Return a film of the first seconds of a dance of AIST++, seen by one of its cameras."""
     name = dances.video(sequence, camera)
     keypoints, lens, true = dances.load(folder, sequence, camera)
-    excerpt = keypoints.cut(0, round(seconds * keypoints.rate) - 1)
+    excerpt = Views((keypoints.cut(0, round(seconds * keypoints.rate) - 1),), (lens,))
     try:
         first, last = frames_with_person(excerpt)
     except InputError as error:
@@ -178,7 +178,7 @@ def film_of_dance(folder: Path, sequence: str, camera: int, seconds: float) -> F
     true = true[first : last + 1]
     if np.isnan(metrics.pelvis(true)).any(axis=(1, 2)).all():
         raise InputError(f"sequences has {name!r}, of which no frame has both hips")
-    return Film(name, excerpt.cut(first, last), lens, true)
+    return Film(name, excerpt.cut(first, last), true)
 
 
 def dances_of(folder: Path, names: Sequence[str], cameras: int, seconds: float) -> dict[str, Callable[[], Film]]:
@@ -209,20 +209,20 @@ def as_fast(preset: physical.FitPreset, share: float) -> physical.FitPreset:
 
 def row_of_film(film: Callable[[], Film], ways: Sequence[Way], preset: physical.FitPreset, seed: int) -> dict[str, Any]:
     """Reconstruct a film in each way and return its errors."""
-    name, keypoints, lens, true = film()
-    lifted = lift.lift(keypoints, lens)
+    name, views, true = film()
+    lifted = lift.lift(views)
 
     def errors_of(points: np.ndarray) -> dict[str, float]:
         return metrics.position_errors(points, true) | metrics.off_the_ground(points) | {
-            "mpjpe_2d_px": metrics.pixel_error(lens.project(points), lens.project(true)),
-            "velocity": metrics.velocity_error(points, true, keypoints.rate),
+            "mpjpe_2d_px": metrics.pixel_error(*(places_in_all(views.cameras, shown) for shown in (points, true))),
+            "velocity": metrics.velocity_error(points, true, views.rate),
             "foot_skate": metrics.foot_skate(points),
         }  # fmt: skip
 
     row: dict[str, Any] = {
         "clip": name,
-        "camera_m": lens.position.tolist(),
-        "frames": len(keypoints),
+        "cameras_m": [camera.position.tolist() for camera in views.cameras],
+        "frames": len(views),
     }
     if not math.isnan(skate := metrics.foot_skate(true)):
         row["true_foot_skate"] = skate
@@ -234,7 +234,7 @@ def row_of_film(film: Callable[[], Film], ways: Sequence[Way], preset: physical.
         way_preset = preset
         if way == "mujoco_timed":
             way_preset = as_fast(preset, row["larp"]["plan_seconds"] / row["mujoco"]["plan_seconds"])
-        reconstruction = reconstruct(keypoints, lifted, names[way], way_preset, seed)
+        reconstruction = reconstruct(views, lifted, names[way], way_preset, seed)
         row[way] = errors_of(reconstruction.executed) | {
             "fell": 100.0 * reconstruction.fell,
             "plan_seconds": reconstruction.effort.seconds,

@@ -46,6 +46,21 @@ def fields_of(path: str | Path) -> tuple[str, Fields]:
     """
     file, _, name = str(path).rpartition(":")
     path, name = (Path(path), "") if not file or Path(path).exists() else (Path(file), name)
+    cameras = _cameras_of(path)
+    if name:
+        require_known(f"camera: the name of one in {path.name}", name, cameras)
+    elif len(cameras) > 1:
+        names = ", ".join(cameras)
+        raise InputError(f"camera: {path.name} has several: {names}; give one as {path.name}:{next(iter(cameras))}")
+    return path.name, cameras[name] if name else next(iter(cameras.values()))
+
+
+def names_of(path: str | Path) -> list[str]:
+    """Return the names of the cameras of a file, in its order."""
+    return list(_cameras_of(Path(path)))
+
+
+def _cameras_of(path: Path) -> dict[str, Fields]:
     require_file("camera", path)
     try:
         cameras = _cameras(path)
@@ -55,12 +70,7 @@ def fields_of(path: str | Path) -> tuple[str, Fields]:
         raise InputError(f"camera: {path.name} is no whole calibration file ({_line(error)})") from None
     if not cameras:
         raise InputError(f"camera: {path.name} has no camera")
-    if name:
-        require_known(f"camera: the name of one in {path.name}", name, cameras)
-    elif len(cameras) > 1:
-        names = ", ".join(cameras)
-        raise InputError(f"camera: {path.name} has several: {names}; give one as {path.name}:{next(iter(cameras))}")
-    return path.name, cameras[name] if name else next(iter(cameras.values()))
+    return cameras
 
 
 def _line(error: Exception) -> str:

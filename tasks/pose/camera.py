@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -51,6 +52,11 @@ class Camera:
         ahead = np.ones((*places.shape[:-1], 1))
         rays: np.ndarray = np.concatenate([(places - self.centre) / self.focal, ahead], axis=-1) @ self.turn
         return rays
+
+
+def places_in_all(cameras: Sequence[Camera], points: Any) -> Any:
+    """Return places (*, C, P, 2) [px] of points (*, P, 3) [m] in the images of C cameras."""
+    return points.__array_namespace__().stack([camera.project(points) for camera in cameras], axis=-3)
 
 
 def looking_at(position: np.ndarray, target: np.ndarray, focal: float, size: tuple[float, float]) -> Camera:

@@ -17,6 +17,8 @@ from tasks.pose.camera import Camera
 from tasks.pose.figure import Pose
 from tasks.pose.lift import Lifted
 
+_CAMERA = ("focal", "centre", "turn", "position")
+
 
 class PlanningEffort(NamedTuple):
     """Effort of planning so far: seconds, seconds of compilation counted separately, and candidates.
@@ -70,11 +72,10 @@ class Progress:
         effort: PlanningEffort = PlanningEffort(),  # noqa: B008
     ) -> None:
         """Write the file."""
-        camera = lifted.camera
         content: dict[str, Any] = {
             "made_by": self._inputs,
             **{f"pose_{name}": value for name, value in lifted.pose._asdict().items()},
-            **{f"camera_{name}": getattr(camera, name) for name in ("focal", "centre", "turn", "position")},
+            **{f"camera_{name}": np.stack([getattr(camera, name) for camera in lifted.cameras]) for name in _CAMERA},
             "proportions": lifted.proportions,
             "error": lifted.error,
             "spent": np.array(effort, float),
@@ -94,10 +95,11 @@ class Progress:
         def values_of(kind: str, fields: tuple[str, ...]) -> Iterator[np.ndarray]:
             return (arrays[f"{kind}_{name}"] for name in fields)
 
-        focal, *others = values_of("camera", ("focal", "centre", "turn", "position"))
-        camera = Camera(float(focal), *others)
+        cameras = tuple(
+            Camera(float(focal), *others) for focal, *others in zip(*values_of("camera", _CAMERA), strict=True)
+        )
         self.lifted = Lifted(
-            Pose(*values_of("pose", Pose._fields)), arrays["proportions"], camera, float(arrays["error"])
+            Pose(*values_of("pose", Pose._fields)), arrays["proportions"], cameras, float(arrays["error"])
         )
         seconds, compiling, *counts = arrays["spent"].tolist()
         self.effort = PlanningEffort(seconds, compiling, *map(int, counts))

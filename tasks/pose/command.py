@@ -16,15 +16,14 @@ from larp_model.files import require_writable, write_whole
 from tasks.command import Teller, prepare_jax, run
 from tasks.models import DynamicsName
 from tasks.motions import angles, bvh
-from tasks.pose import camera as cameras
 from tasks.pose import figure as figures
-from tasks.pose import formats, lift, metrics, physical
-from tasks.pose.camera import Camera
+from tasks.pose import lift, metrics, physical, sources
+from tasks.pose.camera import places_in_all
 from tasks.pose.checkpoint import Progress, fingerprint
 from tasks.pose.lift import Lifted
 from tasks.pose.picture import pose_picture
-from tasks.pose.points import Keypoints, require_inside
 from tasks.pose.reconstruction import DT, Reconstruction, angles_of, cut, overlay_of, reconstruct
+from tasks.pose.views import Views
 from tasks.presets import PresetName
 from viewer import write_overlay
 
@@ -36,69 +35,48 @@ MAX_MEDIAN_ERROR = 0.03
 MAX_SLIP = 0.12
 
 
-def camera_of(path: Path | None, turned: int, film: Keypoints) -> tuple[Keypoints, Camera, bool]:
-    """Return the film without a lens' distortion, its camera, and whether the camera's position is known.
-
-    path: of a camera's file; without one, the camera is held by hand. turned: see `main`.
-    """
-    if path is not None:
-        own_size = film.size if film.size is None or turned % 180 == 0 else (film.size[1], film.size[0])
-        loaded = cameras.load(path, own_size).turned(turned)
-        if film.size == (loaded.size[1], loaded.size[0]) != loaded.size:
-            (width, height), needed = film.size, "0 or 180" if turned % 180 else "90 or 270"
-            raise InputError(
-                f"turned is {turned}, but images of {width:g} x {height:g} px need {needed} for {path.name}"
-            )
-        require_inside(film, loaded.size, "the film")
-        return loaded.lens.straightened(film), loaded.camera, loaded.position_known
-    if film.size is None:
-        raise InputError("size is not known, but the images' width and height are needed, or a camera file with them")
-    return film, cameras.handheld(cameras.focal_length(cameras.FIELD_OF_VIEW, film.size[0]), film.size), False
-
-
-def lifted_of(
-    film: Keypoints, lens: Camera, position_known: bool, height: float | None, progress: Progress, teller: Teller
-) -> Lifted:
+def lifted_of(views: Views, position_known: bool, height: float | None, progress: Progress, teller: Teller) -> Lifted:
     """Return the kinematic start, from the saved progress if it is there.
 
-    position_known: whether the camera's position is known.
+    position_known: whether the cameras' positions are known.
     """
     if progress.lifted is not None:
         steps_done = 0 if progress.checkpoint is None else len(progress.checkpoint.controls)
         teller(f"going on from {progress.path}, {steps_done} steps done")
         return progress.lifted
-    with teller.part(f"laying a figure over {len(film)} frames"):
-        lifted = lift.lift(film, lens, position_known, height)
+    with teller.part(f"laying a figure over {len(views)} frames"):
+        lifted = lift.lift(views, position_known, height)
     progress.save(lifted)
     return lifted
 
 
-def slip_of(film: Keypoints, lens: Camera, lifted: Lifted, teller: Teller) -> float:
+def slip_of(views: Views, lifted: Lifted, teller: Teller) -> float:
     """Return the slip of the kinematic start [m/s], and warn where it, or the fit, shows that the camera moves."""
-    if lifted.error > MAX_MEDIAN_ERROR * 2.0 * np.max(lens.centre):
+    if lifted.error > MAX_MEDIAN_ERROR * 2.0 * np.max(views.cameras[0].centre):
         teller(
             f"half of the points are more than {lifted.error:.0f} px off: does the camera move, or is it another one?"
         )
-    slip = metrics.slip(figures.figure().all_points(lifted.pose, lifted.proportions), film.rate)
+    slip = metrics.slip(figures.figure().all_points(lifted.pose, lifted.proportions), views.rate)
     if slip > MAX_SLIP:
         teller(f"the feet slip, by {slip:.2f} m/s where they ought to stand: does the camera move, or the ground?")
     return slip
 
 
-def summary_of(film: Keypoints, result: Reconstruction, slip: float) -> dict[str, Any]:
+def summary_of(views: Views, result: Reconstruction, slip: float) -> dict[str, Any]:
     """Return the figures of a reconstruction, entries of `summary.json`. slip: see `metrics.slip` [m/s]."""
     lifted, effort = result.lifted, result.effort
-    distances = np.linalg.norm(lifted.camera.project(result.executed) - film.places, axis=-1)[film.detected]
+    distances = np.linalg.norm(places_in_all(lifted.cameras, result.executed) - views.places, axis=-1)
     return {
-        "frames": len(film),
-        "rate": film.rate,
+        "films": len(views.films),
+        "frames": len(views),
+        "rate": views.rate,
         "height_m": float(figures.figure().height(np.asarray(lifted.proportions))),
-        "camera_m": np.asarray(lifted.camera.position, float).tolist(),
-        "focal_px": float(lifted.camera.focal),
+        "cameras_m": [np.asarray(camera.position, float).tolist() for camera in lifted.cameras],
+        "focals_px": [float(camera.focal) for camera in lifted.cameras],
         "kinematic_error_px": lifted.error,
         "slip_m_s": slip,
         "camera_seems_to_move": slip > MAX_SLIP,
-        "error_px": float(np.median(distances)),
+        "error_px": float(np.nanmedian(distances)),
         "fell": result.fell,
         "plan_seconds": effort.seconds,
         "compile_seconds": effort.compile_seconds,
@@ -111,7 +89,8 @@ def summary_of(film: Keypoints, result: Reconstruction, slip: float) -> dict[str
 def table_of(summary: dict[str, Any]) -> Table:
     """Return the summary as a table for display."""
     table = Table("", "", title="Motion from keypoints", show_header=False)
-    table.add_row("frames", f"{summary['frames']}, {summary['frames'] / summary['rate']:.1f} s")
+    films = "" if summary["films"] == 1 else f" of {summary['films']} films"
+    table.add_row("frames", f"{summary['frames']}{films}, {summary['frames'] / summary['rate']:.1f} s")
     table.add_row("height of the person", f"{summary['height_m']:.2f} m")
     table.add_row(
         "points off, half of them by less than",
@@ -122,22 +101,22 @@ def table_of(summary: dict[str, Any]) -> Table:
     return table
 
 
-def write(folder: Path, film: Keypoints, result: Reconstruction, summary: dict[str, Any]) -> None:
+def write(folder: Path, views: Views, result: Reconstruction, summary: dict[str, Any]) -> None:
     """Write the motion, its pictures and, last, `summary.json`; of a human who fell, the kinematic start."""
     buffer = io.BytesIO()
     motion = angles_of(result.filmed.states if result.fell else result.states, result.body, DT)
     np.savez_compressed(buffer, **motion)
     write_whole(folder / "pose.npz", buffer.getvalue())
     write_whole(folder / "pose.bvh", bvh.dumps(angles.motion(**motion)).encode())
-    pose_picture(film, result.lifted.camera, result.executed, result.start, folder / "pose.png")
-    write_overlay(overlay_of(film, result), folder / "pose.html")
+    pose_picture(views, result.lifted.cameras, result.executed, result.start, folder / "pose.png")
+    write_overlay(overlay_of(views, result), folder / "pose.html")
     write_whole(folder / "summary.json", (text.dumps(summary, indent=2) + "\n").encode())
 
 
 def main(
-    keypoints: Annotated[Path, tyro.conf.Positional],
-    rate: float | None = None,
-    camera: Path | None = None,
+    keypoints: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    rate: tuple[float, ...] = (),
+    cameras: tuple[Path, ...] = (),
     turned: Literal[0, 90, 180, 270] = 0,
     size: tuple[float, float] | None = None,
     person: int | None = None,
@@ -150,18 +129,19 @@ def main(
     quiet: bool = False,
     json: bool = False,
 ) -> None:
-    """Motion in 3D from the 2D keypoints of a film. A run that was cut off goes on where it was.
+    """Motion in 3D from the 2D keypoints of films. A run that was cut off goes on where it was.
 
     Args:
-        keypoints: of OpenPose (a folder), AlphaPose, MMPose, MediaPipe or YOLO (JSON, or a folder of labels), or npz.
-        rate: frames a second of the film, where the file does not say.
-        camera: file of the camera, which stands still: a calibration of OpenCV (YAML, JSON), EasyMocap, Pose2Sim (TOML)
-            or COLMAP, as FILE:NAME where it has several; or JSON with field_of_view (degrees) or focal (px), size,
-            centre, distortion and, where they are known, position and look_at or rotation; a phone's by default, its
-            height and tilt estimated.
+        keypoints: of OpenPose (a folder), AlphaPose, MMPose, MediaPipe or YOLO (JSON, or a folder of labels), or npz;
+            of several cameras one each. The films may begin at different times.
+        rate: frames a second of the film, where the file does not say; of several films one number, or each one's.
+        cameras: file of the camera, which stands still: a calibration of OpenCV (YAML, JSON), EasyMocap, Pose2Sim
+            (TOML) or COLMAP, as FILE:NAME where it has several; or JSON with field_of_view (degrees) or focal (px),
+            size, centre, distortion and, where they are known, position and look_at or rotation; a phone's by default,
+            its height and tilt estimated. Of several films, one calibration with all cameras, or each one's.
         turned: degrees clockwise by which the images were turned after the camera was calibrated.
         size: width and height of the images (px), where neither file says.
-        person: which of several, in order of appearance from 0; the one who is seen best by default.
+        person: which of several in the first film, in order of appearance from 0; the one who is seen best by default.
         points: order of a person's points, such as coco, body_25 or body_25b, where it is not recognised.
         height: of the person (m); where it is not known, it is estimated by a camera whose position is, and taken to be
             1.75 m by any other.
@@ -176,31 +156,31 @@ def main(
     if height is not None and not HEIGHTS[0] <= height <= HEIGHTS[1]:
         raise InputError(f"height is {height:g}, but must be from {HEIGHTS[0]:g} to {HEIGHTS[1]:g} m")
     require_writable(out, "out")
-    loaded = formats.load(keypoints, rate, size, person, points)
-    film, lens, position_known = camera_of(camera, turned, cut(loaded.keypoints))
+    loaded = sources.load(keypoints, rate, size, person, points, cameras, turned)
+    views = cut(loaded.views)
     prepare_jax()
     teller = Teller(quiet, json)
     for note in loaded.notes:
         teller(note)
     if loaded.crossed:
         teller(f"another person is before or behind this one in {loaded.crossed} frames: look at them in pose.png")
-    camera_inputs = lens.focal, lens.centre, lens.turn, lens.position, position_known
-    other_inputs = height or 0.0, dynamics, repr(physical.PRESETS[preset]), seed
-    inputs = fingerprint(film.places, film.confidence, film.rate, *camera_inputs, *other_inputs)
+    camera_inputs = [(one.focal, *one.centre, *one.turn.ravel(), *one.position) for one in views.cameras]
+    other_inputs = loaded.position_known, height or 0.0, dynamics, repr(physical.PRESETS[preset]), seed
+    inputs = fingerprint(views.places, views.confidence, views.rate, camera_inputs, *other_inputs)
     progress = Progress(out / "unfinished.npz", inputs)
-    lifted = lifted_of(film, lens, position_known, height, progress, teller)
-    slip = slip_of(film, lens, lifted, teller)
+    lifted = lifted_of(views, loaded.position_known, height, progress, teller)
+    slip = slip_of(views, lifted, teller)
     with teller.bar("planning and executing") as on_step:
-        result = reconstruct(film, lifted, dynamics, physical.PRESETS[preset], seed, progress, on_step)
+        result = reconstruct(views, lifted, dynamics, physical.PRESETS[preset], seed, progress, on_step)
     if result.fell:
         teller("the human fell: pose.npz and pose.bvh hold the kinematic start instead, which no physics has seen")
-    summary = summary_of(film, result, slip) | {
+    summary = summary_of(views, result, slip) | {
         "people": loaded.people,
         "crossed": loaded.crossed,
         "read": loaded.notes,
     }
     summary |= {"dynamics": dynamics, "preset": preset, "seed": seed}
-    write(out, film, result, summary)
+    write(out, views, result, summary)
     progress.delete()
     teller.result(table_of(summary), summary)
     teller(f"{out}/: summary.json, pose.npz, pose.bvh, pose.png, pose.html")

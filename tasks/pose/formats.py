@@ -24,7 +24,7 @@ from tasks.pose.detectors import (
     json_film,
     shortened,
 )
-from tasks.pose.people import Detection, is_crossed, prominence, tracks_of
+from tasks.pose.people import Detection, Track, is_crossed, prominence, tracks_of
 from tasks.pose.point_orders import ORDERS, in_our_order, order_of
 from tasks.pose.points import POINTS, RATES, Keypoints, require_inside
 
@@ -49,6 +49,52 @@ class LoadedKeypoints(NamedTuple):
     notes: tuple[str, ...]
 
 
+class LoadedPeople(NamedTuple):
+    """People of a film, in order of appearance.
+
+    name: of the file. tracks: each person's points by frame. frames: of the film, with all people's points. rate:
+    frames per second. size: width and height of the images [px], if they are known. notes: see `LoadedKeypoints`.
+    """
+
+    name: str
+    tracks: list[Track]
+    frames: list[list[Detection]]
+    rate: float
+    size: tuple[float, float] | None
+    notes: tuple[str, ...]
+
+    @property
+    def most_prominent(self) -> int:
+        """Return the index of the person who is seen best."""
+        return self.by_prominence[0]
+
+    @property
+    def by_prominence(self) -> list[int]:
+        """Return the people's indices by the sum of confidence times height in the image, the greatest first."""
+        return sorted(range(len(self.tracks)), key=lambda person: -prominence(self.tracks[person]))
+
+    def keypoints(self, person: int) -> LoadedKeypoints:
+        """Return the keypoints of a person, by index; an InputError names a person of whom too little is seen."""
+        if person not in range(len(self.tracks)):
+            raise InputError(
+                f"person is {person}, but must be from 0 to below {len(self.tracks)}, the people in {self.name}"
+            )
+        track = self.tracks[person]
+        rows = np.full((len(self.frames), len(POINTS), 3), (np.nan, np.nan, 0.0))
+        rows[list(track)] = [one.points for one in track.values()]
+        detected = np.flatnonzero(rows[..., 2].any(axis=0))
+        if len(detected) < _MIN_POINTS:
+            detected_names = ", ".join(POINTS[point] for point in detected)
+            raise InputError(
+                f"{self.name} has only {detected_names} of this person, but needs {_MIN_POINTS} points or more"
+            )
+        keypoints = Keypoints(rows[..., :2], rows[..., 2], self.rate, self.size)
+        if self.size is not None:
+            require_inside(keypoints, self.size, self.name)
+        crossed = sum(is_crossed(one, self.frames[frame]) for frame, one in track.items())
+        return LoadedKeypoints(keypoints, len(self.tracks), crossed, self.notes)
+
+
 def load(
     path: str | Path,
     rate: float | None = None,
@@ -56,13 +102,22 @@ def load(
     person: int | None = None,
     points: str | None = None,
 ) -> LoadedKeypoints:
-    """Read one person's points; an InputError of one line names what is missing, damaged or not understood.
+    """Read one person's points, by index from 0 in order of appearance, or the most prominent; see `load_people`."""
+    people = load_people(path, rate, size, points)
+    return people.keypoints(people.most_prominent if person is None else person)
+
+
+def load_people(
+    path: str | Path,
+    rate: float | None = None,
+    size: tuple[float, float] | None = None,
+    points: str | None = None,
+) -> LoadedPeople:
+    """Read the points of all people; an InputError of one line names what is missing, damaged or not understood.
 
     path: a file, or a folder with one for each frame. rate: frames per second. size: width and height of the images
-    [px]. Only npz files store these two, and the arguments take precedence. person: index from 0 in order of
-    appearance; by default the one with the greatest sum of confidence times height in the image. points: the name of
-    their order, one of `point_orders.ORDERS`; recognised by default. The frame with the lowest number in the file comes
-    first.
+    [px]. Only npz files store these two, and the arguments take precedence. points: the name of their order, one of
+    `point_orders.ORDERS`; recognised by default. The frame with the lowest number in the file comes first.
 
     An npz file has names (P,) out of `POINTS`, and places (T, P, 2), NaN where not detected, optionally with confidence
     (T, P), or points (T, P, 3) that contain both; optionally also rate and size (2,).
@@ -84,21 +139,7 @@ def load(
         raise InputError(f"rate is not known, {name} does not hold it: give frames a second")
     if not RATES[0] <= rate <= RATES[1]:
         raise InputError(f"rate is {rate:g}, but must be from {RATES[0]:g} to {RATES[1]:g} frames a second")
-    tracks = tracks_of(frames, rate)
-    if person is not None and person not in range(len(tracks)):
-        raise InputError(f"person is {person}, but must be from 0 to below {len(tracks)}, the people in {name}")
-    track = max(tracks, key=prominence) if person is None else tracks[person]
-    rows = np.full((len(frames), len(POINTS), 3), (np.nan, np.nan, 0.0))
-    rows[list(track)] = [one.points for one in track.values()]
-    detected = np.flatnonzero(rows[..., 2].any(axis=0))
-    if len(detected) < _MIN_POINTS:
-        detected_names = ", ".join(POINTS[point] for point in detected)
-        raise InputError(f"{name} has only {detected_names} of this person, but needs {_MIN_POINTS} points or more")
-    keypoints = Keypoints(rows[..., :2], rows[..., 2], float(rate), size or film.size)
-    if keypoints.size is not None:
-        require_inside(keypoints, keypoints.size, name)
-    crossed = sum(is_crossed(one, frames[frame]) for frame, one in track.items())
-    return LoadedKeypoints(keypoints, len(tracks), crossed, notes)
+    return LoadedPeople(name, tracks_of(frames, rate), frames, float(rate), size or film.size, notes)
 
 
 def _read(path: Path) -> DetectedFilm:

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from larp_model.rotation import from_rotation_vector, matrix
-from tasks.pose.camera import Camera
+from tasks.pose.camera import Camera, places_in_all
 from tasks.pose.figure import SHARED, Figure
 
 SHARED_VALUES = SHARED + 3 + 2
@@ -33,12 +33,15 @@ def estimated_camera(camera: Camera, shared: np.ndarray) -> Camera:
     return Camera(camera.focal, camera.centre, np.asarray(corrected.turn, float), np.asarray(corrected.position, float))
 
 
-def points_and_places(body: Figure, camera: Camera, turn: Array, change: Array, shared: Array) -> tuple[Array, Array]:
-    """Return points (P, 3) [m] and their places (P, 2) [px].
+def points_and_places(
+    body: Figure, cameras: tuple[Camera, ...], turn: Array, change: Array, shared: Array
+) -> tuple[Array, Array]:
+    """Return points (P, 3) [m] and their places (C, P, 2) [px] in the images of C cameras.
 
     turn: rotation (3, 3) of the pelvis before the change. change: (D,) place [m], rotation vector [rad], joint angles
     [rad]. shared: (S,), see the module.
     """
     rotation = matrix(from_rotation_vector(change[3:6])) @ turn
     points = body.points(change[:3], rotation, change[6:].reshape(-1, 3), shared[:SHARED])
-    return points, tilted(camera, shared[SHARED : SHARED + 3]).project(points)
+    corrections = shared[SHARED : SHARED + 3]
+    return points, places_in_all([tilted(camera, corrections) for camera in cameras], points)

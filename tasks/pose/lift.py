@@ -27,18 +27,20 @@ import numpy as np
 from jax import Array
 from scipy.spatial.transform import Rotation
 
+from larp_model.errors import InputError
 from mpc.damping import next_damping
 from tasks.pose.banded import Banded
-from tasks.pose.camera import Camera
+from tasks.pose.camera import Camera, places_in_all
 from tasks.pose.figure import SHARED, SOLE_HEIGHT, USUAL_HEIGHT, Figure, Pose, figure
 from tasks.pose.image import HEIGHT_STD, ROLL_STD, SHARED_VALUES, TILT_STD, estimated_camera, points_and_places
 from tasks.pose.per_frame import PerFrameFit
-from tasks.pose.points import FEET, POINTS, SIDES, Keypoints
+from tasks.pose.points import FEET, POINTS, SIDES
 from tasks.pose.prior import prior_residuals
 from tasks.pose.rows import by_rows, single
+from tasks.pose.views import Views
 
-# Standard deviations: of a detector's points, as a share of the image's larger side; of the body's size, as a share.
-PIXEL_STD, SIZE_STD = 0.004, 0.06
+# Standard deviation of the body's size, as a share.
+SIZE_STD = 0.06
 # Standard deviations of `figure.PROPORTIONS` and of the shoulders' shift: detectors place hips and trunks with a bias,
 # limbs differ little.
 PROPORTION_STD = (0.15, 0.15, 0.15, 0.15, 0.06, 0.12, 0.06, 0.06, 0.1, 0.15)
@@ -71,20 +73,20 @@ _SWAPS = (
 class Lifted(NamedTuple):
     """Figure fitted to all frames.
 
-    pose: see `figure.Pose`. proportions: (11,), see `Figure`. camera: the film's, or as estimated. error: median
+    pose: see `figure.Pose`. proportions: (11,), see `Figure`. cameras: the films', or as estimated. error: median
     reprojection error of the detected points [px].
     """
 
     pose: Pose
     proportions: np.ndarray
-    camera: Camera
+    cameras: tuple[Camera, ...]
     error: float
 
 
 class PoseQuantities(NamedTuple):
     """Quantities that follow from a pose and the shared values.
 
-    points: (T, P, 3) [m]. places: (T, P, 2) [px]. prior: its residuals (T, K). heights: of the soles (T, 4) [m].
+    points: (T, P, 3) [m]. places: (T, C, P, 2) [px]. prior: its residuals (T, K). heights: of the soles (T, 4) [m].
     """
 
     points: np.ndarray
@@ -102,17 +104,16 @@ class ResidualTerm(NamedTuple):
 
 
 class _FilmFit:
-    """Least-squares problem of one film."""
+    """Least-squares problem of a film, or of several at once."""
 
-    def __init__(self, keypoints: Keypoints, camera: Camera, position_known: bool, height: float | None) -> None:
-        self.keypoints, self.camera, self.position_known, self.figure = keypoints, camera, position_known, figure()
-        self.sigma = noise(keypoints, camera)
-        self.per_frame = PerFrameFit(keypoints, camera, self.sigma)
+    def __init__(self, views: Views, position_known: bool, height: float | None) -> None:
+        self.views, self.position_known, self.figure = views, position_known, figure()
+        self.sigma, self.per_frame = views.sigma[:, None, None], PerFrameFit(views)
         camera_std = (1e-4, 1e-4, 1e-4) if position_known else (TILT_STD, ROLL_STD, HEIGHT_STD)
         if height is None and not position_known:
             height = USUAL_HEIGHT
         duration, std = (
-            len(keypoints) / keypoints.rate,
+            len(views) / views.rate,
             np.array([SIZE_STD, *PROPORTION_STD, *camera_std, SOLE_STD, SOLE_STD]),
         )
         self.usual, self.prior = np.zeros(SHARED_VALUES), duration * np.diag(1.0 / std**2)
@@ -136,7 +137,7 @@ class _FilmFit:
 
     def solve_together(self, pose: Pose, shared: np.ndarray, steps: int) -> tuple[Pose, np.ndarray]:
         """Return the pose and the shared values (S,) after at most `steps` steps on all frames together."""
-        places, confidence = self.keypoints.places, self.keypoints.confidence
+        places, confidence = self.views.places, self.views.confidence
         for round_ in range(3):
             damping = 1e-2
             if round_:
@@ -179,31 +180,34 @@ class _FilmFit:
             side_rows, other_rows = left + right, right + left
 
             def misfit(rows: list[int], side_rows: list[int] = side_rows) -> np.ndarray:
-                distances = np.linalg.norm(fitted[:, side_rows] - places[:, rows], axis=-1) / self.sigma
-                total: np.ndarray = np.nansum(np.minimum(distances, 20.0) * confidence[:, rows], axis=1)
+                offsets = (fitted[..., side_rows, :] - places[..., rows, :]) / self.sigma
+                distances = np.minimum(np.linalg.norm(offsets, axis=-1), 20.0)
+                total: np.ndarray = np.nansum(distances * confidence[..., rows], axis=-1)
                 return total
 
             is_swapped = misfit(side_rows) > 1.3 * misfit(other_rows) + 10.0
-            places[:, side_rows] = np.where(is_swapped[:, None, None], places[:, other_rows], places[:, side_rows])
-            confidence[:, side_rows] = np.where(
-                is_swapped[:, None], confidence[:, other_rows], confidence[:, side_rows]
+            places[..., side_rows, :] = np.where(
+                is_swapped[..., None, None], places[..., other_rows, :], places[..., side_rows, :]
+            )
+            confidence[..., side_rows] = np.where(
+                is_swapped[..., None], confidence[..., other_rows], confidence[..., side_rows]
             )
         return places, confidence
 
     def terms(self, pose: Pose, shared: np.ndarray, places: np.ndarray, confidence: np.ndarray) -> list[ResidualTerm]:
         """Return the residual terms around a pose, with weights and derivatives evaluated there."""
-        frames, count, rate = len(pose.place), len(POINTS), self.keypoints.rate
+        frames, rate = len(pose.place), self.views.rate
         quantities = self.quantities(pose, shared)
         of_points, of_places, of_prior = self.derivatives(pose, shared)
         frame_weight = 30.0 / rate  # neighbouring frames at a high frame rate add little information
         is_detected = (confidence > 0.0)[..., None]
+        pixels = np.repeat(self.views.sigma, 2 * len(POINTS))
 
         def image(quantities: PoseQuantities) -> np.ndarray:
-            return (np.where(is_detected, quantities.places - np.nan_to_num(places), 0.0) / self.sigma).reshape(
-                frames, -1
-            )
+            residuals: np.ndarray = np.where(is_detected, quantities.places - np.nan_to_num(places), 0.0) / self.sigma
+            return residuals.reshape(frames, -1)
 
-        image_residuals = image(quantities).reshape(frames, count, 2)
+        image_residuals = image(quantities).reshape(*confidence.shape, 2)
         image_weights = frame_weight * confidence / (1.0 + (image_residuals**2).sum(axis=-1) / OUTLIER**2) ** 2
         scales = np.array([ACCELERATIONS.get(name.partition("_")[2], TRUNK_ACCELERATION) for name in POINTS]) / rate**2
         acceleration_weights = (
@@ -223,7 +227,9 @@ class _FilmFit:
         of_heights[:, [0, 2], -2] -= 1.0
         of_heights[:, [1, 3], -1] -= 1.0
         return [
-            ResidualTerm(np.repeat(image_weights, 2, axis=1), image, ((0, of_places / self.sigma),)),
+            ResidualTerm(
+                np.repeat(image_weights.reshape(frames, -1), 2, axis=1), image, ((0, of_places / pixels[:, None]),)
+            ),
             ResidualTerm(
                 np.repeat(acceleration_weights, 3, axis=1),
                 lambda quantities: second_differences(quantities.points).reshape(frames - 2, -1),
@@ -250,7 +256,7 @@ class _FilmFit:
 
         x is the centre of mass at height z, p the centre of pressure, the mean of the feet weighted by `standing`.
         """
-        rate, mass = self.keypoints.rate, np.array([MASSES.get(name.rpartition("_")[2], 0.0) for name in POINTS])
+        rate, mass = self.views.rate, np.array([MASSES.get(name.rpartition("_")[2], 0.0) for name in POINTS])
         mass /= mass.sum()
         share = standing[1:-1] + 1e-9
         share = share / share.sum(axis=1, keepdims=True)
@@ -288,7 +294,7 @@ class _FilmFit:
     def derivatives(self, pose: Pose, shared: np.ndarray) -> list[np.ndarray]:
         """Return derivatives by pose and shared values.
 
-        They are those of points (T, 3 P, D + S), places (T, 2 P, D + S) and prior residuals (T, K, D + S).
+        They are those of points (T, 3 P, D + S), places (T, 2 C P, D + S) and prior residuals (T, K, D + S).
         """
         stacked = self.by_frames(_all_derivatives, pose, shared)
         return [derivatives.reshape(len(derivatives), -1, derivatives.shape[-1]) for derivatives in stacked]
@@ -297,20 +303,24 @@ class _FilmFit:
         """Return the result of a compiled `_frame_quantities` or `_frame_derivatives` for all frames."""
         no_rotation = np.zeros_like(pose.place)
         change = np.concatenate([pose.place, no_rotation, pose.angles.reshape(len(pose.place), -1)], axis=1)
-        camera, shared_values = single((self.camera, shared))
+        cameras, shared_values = single((self.views.cameras, shared))
         return by_rows(
-            lambda turn, change: function(self.figure, camera, turn, change, shared_values), pose.turn, change
+            lambda turn, change: function(self.figure, cameras, turn, change, shared_values), pose.turn, change
         )
 
 
-def _frame_quantities(body: Figure, camera: Camera, turn: Array, change: Array, shared: Array) -> tuple[Array, ...]:
-    """Return points (P, 3) [m] of one frame, their places (P, 2) [px], and the prior residuals (K,) of its pose."""
-    return *points_and_places(body, camera, turn, change, shared), prior_residuals(body, turn, change)
+def _frame_quantities(
+    body: Figure, cameras: tuple[Camera, ...], turn: Array, change: Array, shared: Array
+) -> tuple[Array, ...]:
+    """Return points (P, 3) [m] of one frame, their places (C, P, 2) [px], and the prior residuals (K,) of its pose."""
+    return *points_and_places(body, cameras, turn, change, shared), prior_residuals(body, turn, change)
 
 
-def _frame_derivatives(body: Figure, camera: Camera, turn: Array, change: Array, shared: Array) -> tuple[Array, ...]:
+def _frame_derivatives(
+    body: Figure, cameras: tuple[Camera, ...], turn: Array, change: Array, shared: Array
+) -> tuple[Array, ...]:
     """Return the derivatives of `_frame_quantities` by change and shared values (D + S,), on their last axis."""
-    by_argument = jax.jacfwd(_frame_quantities, (3, 4))(body, camera, turn, change, shared)
+    by_argument = jax.jacfwd(_frame_quantities, (3, 4))(body, cameras, turn, change, shared)
     return tuple(jnp.concatenate(parts, axis=-1) for parts in by_argument)
 
 
@@ -319,11 +329,6 @@ _all_quantities, _all_derivatives = (
     jax.jit(jax.vmap(function, (None, None, 0, 0, None)), static_argnums=0)
     for function in (_frame_quantities, _frame_derivatives)
 )
-
-
-def noise(keypoints: Keypoints, camera: Camera) -> float:
-    """Return the standard deviation [px] of detected keypoints."""
-    return PIXEL_STD * float(max(keypoints.size or 2.0 * np.asarray(camera.centre)))
 
 
 def second_differences(values: np.ndarray) -> np.ndarray:
@@ -338,14 +343,17 @@ def _stepped(pose: Pose, change: np.ndarray) -> Pose:
     return Pose(pose.place + change[:, :3], turn, pose.angles + change[:, 6:].reshape(pose.angles.shape))
 
 
-def lift(keypoints: Keypoints, camera: Camera, position_known: bool = True, height: float | None = None) -> Lifted:
+def lift(views: Views, position_known: bool = True, height: float | None = None) -> Lifted:
     """Return the figure fitted to all frames, of which the first and the last must show most of a person.
 
-    position_known: whether the camera's position is known; else its tilt and height are estimated, from its own ones.
-    height: of the person [m], where it is known; the usual one by default where the camera is not known.
+    position_known: whether the cameras' positions are known; else the tilt and height of one are estimated, from its
+    own ones. height: of the person [m], where it is known; the usual one by default where the camera is not known.
     """
-    film_fit = _FilmFit(keypoints, camera, position_known, height)
+    if not position_known and len(views.cameras) > 1:
+        raise InputError(f"cameras are {len(views.cameras)}, whose positions are not all known, but must be")
+    film_fit = _FilmFit(views, position_known, height)
     pose, shared = film_fit.solve()
-    distances = np.linalg.norm(film_fit.quantities(pose, shared).places - keypoints.places, axis=-1)
-    fitted_camera = camera if position_known else estimated_camera(camera, shared)
-    return Lifted(pose, shared[:SHARED], fitted_camera, float(np.nanmedian(distances)))
+    cameras = views.cameras if position_known else (estimated_camera(views.cameras[0], shared),)
+    points = figure().all_points(pose, shared[:SHARED])
+    distances = np.linalg.norm(places_in_all(cameras, points) - views.places, axis=-1)
+    return Lifted(pose, shared[:SHARED], cameras, float(np.nanmedian(distances)))

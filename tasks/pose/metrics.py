@@ -100,8 +100,8 @@ def slip(points: np.ndarray, rate: float) -> float:
 
 
 def pixel_error(places: np.ndarray, true: np.ndarray) -> float:
-    """Return the mean distance [px] of the joints' places (T, P, 2) from the true ones."""
-    return float(np.nanmean(np.linalg.norm(places[:, JOINTS] - true[:, JOINTS], axis=-1)))
+    """Return the mean distance [px] of the joints' places (*, P, 2) from the true ones."""
+    return float(np.nanmean(np.linalg.norm(places[..., JOINTS, :] - true[..., JOINTS, :], axis=-1)))
 
 
 def off_the_ground(points: np.ndarray) -> dict[str, float]:

@@ -21,9 +21,10 @@ from scipy.spatial.transform import Rotation, Slerp
 from tasks.pose.camera import Camera
 from tasks.pose.figure import SHARED, SOLE_HEIGHT, Figure, Pose, figure
 from tasks.pose.image import TILT_STD, estimated_camera, points_and_places
-from tasks.pose.points import FEET, POINTS, Keypoints
+from tasks.pose.points import FEET, POINTS
 from tasks.pose.prior import INITIAL_POSES, prior_residuals, usual_poses
 from tasks.pose.rows import by_rows, single
+from tasks.pose.views import Views
 
 # Frames per second that are solved alone, initial headings of each, and steps of the solver.
 FRAME_RATE, HEADINGS, STEPS = 12.0, 12, 12
@@ -37,11 +38,10 @@ TILTS, HEIGHT_STD, TILT_FRAMES = (-0.1, 0.0, 0.1, 0.2, 0.3, 0.45), 0.1, 6
 
 
 class PerFrameFit:
-    """Least-squares problems of the single frames of one film."""
+    """Least-squares problems of the single frames of a film, or of several at once."""
 
-    def __init__(self, keypoints: Keypoints, camera: Camera, sigma: float) -> None:
-        """Set up the problems; sigma: standard deviation of the keypoints [px]."""
-        self.keypoints, self.camera, self.sigma, self.figure = keypoints, camera, sigma, figure()
+    def __init__(self, views: Views) -> None:
+        self.views, self.figure = views, figure()
         self.usual_angles = usual_poses()[2]
 
     def solve(
@@ -51,8 +51,8 @@ class PerFrameFit:
 
         free: (D,) 1 for the degrees of freedom that may change, else 0. Returns turns, changes and costs (F, S).
         """
-        common = single((self.camera, self.sigma, shared, free))
-        values = (np.nan_to_num(array[frames]) for array in (self.keypoints.places, self.keypoints.confidence))
+        common = single((self.views.cameras, self.views.sigma, shared, free))
+        values = (np.nan_to_num(array[frames]) for array in (self.views.places, self.views.confidence))
         places, weights = (np.repeat(array, guesses.shape[1], axis=0) for array in values)
         rows_of_arguments = turns.reshape(-1, 3, 3), places, weights, guesses.reshape(len(places), -1)
         changes, costs = by_rows(lambda *rows: _all_solved(self.figure, *common, *rows), *rows_of_arguments)
@@ -63,19 +63,20 @@ class PerFrameFit:
     def initial_guesses(self, frames: np.ndarray, shared: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return starts of frames (F,): turns (F, S, 3, 3) and changes (F, S, D), of every heading and usual pose.
 
-        The distance from the camera follows from the size of the person in the image.
+        The distance from the camera follows from the size of the person in the image that shows most points.
         """
-        camera = estimated_camera(self.camera, shared)
+        cameras = [estimated_camera(camera, shared) for camera in self.views.cameras]
         headings = np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False)
         turns = np.repeat(Rotation.from_rotvec(headings[:, None] * (0.0, 0.0, 1.0)).as_matrix(), INITIAL_POSES, axis=0)
         angles = np.tile(self.usual_angles, (HEADINGS, 1, 1))
         pose = Pose(np.zeros((len(turns), 3)), turns, angles)
         points_at_origin = self.figure.all_points(pose, shared[:SHARED])
-        local = points_at_origin @ camera.turn.T
         guesses = np.zeros((len(frames), len(turns), 6 + 3 * self.figure.joints))
         for row, frame in enumerate(frames):
-            is_detected = self.keypoints.detected[frame]
-            places = self.keypoints.places[frame, is_detected]
+            view = int(self.views.confidence[frame].sum(axis=-1).argmax())
+            camera, film = cameras[view], self.views.films[view]
+            is_detected, local = film.detected[frame], points_at_origin @ camera.turn.T
+            places = film.places[frame, is_detected]
             spread = np.sqrt(local[:, is_detected, :2].var(axis=1).sum(axis=-1))
             depth = np.clip(camera.focal * spread / max(np.sqrt(places.var(axis=0).sum()), 1.0), 1.0, 60.0)
             ray = camera.ray(places.mean(axis=0))
@@ -87,7 +88,7 @@ class PerFrameFit:
         """Return the index of the chosen solution of each frame (F,), by points (F, S, P, 3) [m] and costs (F, S)."""
         least_cost, previous = costs[0], []
         for row in range(1, len(frames)):
-            reach = MOTION_SPEED * (frames[row] - frames[row - 1]) / self.keypoints.rate
+            reach = MOTION_SPEED * (frames[row] - frames[row - 1]) / self.views.rate
             distance = np.linalg.norm(points[row - 1][:, None] - points[row][None], axis=-1)
             total = least_cost[:, None] + MOTION_WEIGHT * (distance**2).mean(axis=-1) / reach**2
             previous.append(total.argmin(axis=0))
@@ -100,8 +101,8 @@ class PerFrameFit:
     @cached_property
     def frames(self) -> np.ndarray:
         """Return the indices of the frames that are solved alone."""
-        interval = max(1, round(self.keypoints.rate / FRAME_RATE))
-        usable = np.flatnonzero((self.keypoints.confidence > 0.3).sum(axis=1) >= 6)
+        interval = max(1, round(self.views.rate / FRAME_RATE))
+        usable = self.views.frames_with_person
         return np.unique(np.append(usable[::interval], usable[-1]))
 
     def points(self, turns: np.ndarray, changes: np.ndarray, shared: np.ndarray) -> np.ndarray:
@@ -118,7 +119,7 @@ class PerFrameFit:
         turns, changes, costs = self.solve(self.frames, turns, guesses, free, shared)
         points = self.points(turns, changes, shared)
         rows = np.arange(len(self.frames)), self.least_motion(self.frames, points, costs)
-        return _interpolated_pose(self.frames, changes[rows], turns[rows], len(self.keypoints))
+        return _interpolated_pose(self.frames, changes[rows], turns[rows], len(self.views))
 
     def first_pose(self, shared: np.ndarray) -> Pose:
         """Return a pose in all frames, without an initial guess."""
@@ -186,21 +187,22 @@ def _interpolated_pose(frames: np.ndarray, changes: np.ndarray, turns: np.ndarra
 
 
 def _residuals(
-    body: Figure, camera: Camera, sigma: Array, shared: Array, turn: Array, places: Array, weights: Array, change: Array
-) -> Array:
-    """Return the residuals of one frame with places (P, 2) [px] of weights (P,); see `image.points_and_places`."""
-    points, fitted = points_and_places(body, camera, turn, change, shared)
-    image = jnp.sqrt(weights)[:, None] * (fitted - places) / (3.0 * sigma)
+    body: Figure, cameras: tuple[Camera, ...], sigma: Array, shared: Array,
+    turn: Array, places: Array, weights: Array, change: Array,
+) -> Array:  # fmt: skip
+    """Return the residuals of one frame with places (C, P, 2) [px] of weights (C, P); see `image.points_and_places`."""
+    points, fitted = points_and_places(body, cameras, turn, change, shared)
+    image = jnp.sqrt(weights)[..., None] * (fitted - places) / (3.0 * sigma[:, None, None])
     depth = jnp.minimum(points[jnp.array(FEET), 2], 0.0) / DEPTH_STD
     return jnp.concatenate([image.ravel(), prior_residuals(body, turn, change), depth])
 
 
 def _solved(
-    body: Figure, camera: Camera, sigma: Array, shared: Array, free: Array,
+    body: Figure, cameras: tuple[Camera, ...], sigma: Array, shared: Array, free: Array,
     turn: Array, places: Array, weights: Array, change: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Return a change (D,) and its cost after `STEPS` Levenberg-Marquardt steps; free: (D,) 1 where it may change."""
-    residuals = partial(_residuals, body, camera, sigma, shared, turn, places, weights)
+    residuals = partial(_residuals, body, cameras, sigma, shared, turn, places, weights)
 
     def step(carry: tuple[Array, Array, Array], _: None) -> tuple[tuple[Array, Array, Array], None]:
         change, damping, cost = carry

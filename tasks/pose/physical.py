@@ -33,10 +33,11 @@ from mpc.loop import Checkpoint, Execution, Phase, execute
 from tasks.exploration import exploration_std
 from tasks.motions.references import clearance, with_angular_velocities, with_servo_lead
 from tasks.motions.skeleton import sampled_times
-from tasks.pose.camera import Camera
+from tasks.pose.camera import Camera, places_in_all
 from tasks.pose.figure import Figure, Pose
-from tasks.pose.lift import OUTLIER, STANDING_SPEED, Lifted, noise
-from tasks.pose.points import FEET, POINTS, Keypoints, interpolated
+from tasks.pose.lift import OUTLIER, STANDING_SPEED, Lifted
+from tasks.pose.points import FEET, POINTS, interpolated
+from tasks.pose.views import Views
 from tasks.presets import PresetName
 
 # Spread of a first plan, as a share of the training data's spread around its motions.
@@ -75,8 +76,8 @@ PRESETS: dict[PresetName, FitPreset] = {
 class FilmedMotion(NamedTuple):
     """Motion that a film shows, at each of N steps.
 
-    states (N, L, 13) and targets (N, J, 3) [rad] of the kinematic start; places (N, P, 2) [px] and weights (N, P) of
-    the keypoints; standing (N, 4), from 0 to 1, how likely heels and toes stand.
+    states (N, L, 13) and targets (N, J, 3) [rad] of the kinematic start; places (N, C, P, 2) [px] and weights (N, C, P)
+    of the keypoints of C cameras; standing (N, 4), from 0 to 1, how likely heels and toes stand.
     """
 
     states: np.ndarray
@@ -86,11 +87,11 @@ class FilmedMotion(NamedTuple):
     standing: np.ndarray
 
 
-def filmed_motion(scene: Scene, figure: Figure, lifted: Lifted, keypoints: Keypoints) -> FilmedMotion:
+def filmed_motion(scene: Scene, figure: Figure, lifted: Lifted, views: Views) -> FilmedMotion:
     """Return the kinematic start and the keypoints, resampled to the steps of the scene."""
     human = scene.human
-    frame_times, rate = keypoints.times, keypoints.rate
-    times = sampled_times(len(keypoints), rate, scene.dt)
+    frame_times, rate = views.times, views.rate
+    times = sampled_times(len(views), rate, scene.dt)
     place = interpolated(lifted.pose.place, rate, times)
     root = Slerp(frame_times, Rotation.from_matrix(lifted.pose.turn))(times)
     angles = np.clip(interpolated(lifted.pose.angles, rate, times), figure.lower, figure.upper)
@@ -100,12 +101,12 @@ def filmed_motion(scene: Scene, figure: Figure, lifted: Lifted, keypoints: Keypo
     states[:, 0, packed.VELOCITY] = np.gradient(place, scene.dt, axis=0)
     states = closed(scene, with_angular_velocities(states, scene.dt))
 
-    places_detected = np.nan_to_num(keypoints.places)
-    places_of_figure = lifted.camera.project(figure.all_points(lifted.pose, lifted.proportions))
-    distances = np.linalg.norm(places_of_figure - places_detected, axis=-1) / noise(keypoints, lifted.camera)
-    weights = keypoints.confidence / (1.0 + (distances / OUTLIER) ** 2) ** 2
-    nearest = np.minimum(np.rint(times * rate).astype(int), len(keypoints) - 1)
-    places = interpolated(np.where(keypoints.detected[..., None], places_detected, places_of_figure), rate, times)
+    places_detected, confidence = np.nan_to_num(views.places), views.confidence
+    places_of_figure = places_in_all(lifted.cameras, figure.all_points(lifted.pose, lifted.proportions))
+    distances = np.linalg.norm(places_of_figure - places_detected, axis=-1) / views.sigma[:, None]
+    weights = confidence / (1.0 + (distances / OUTLIER) ** 2) ** 2
+    nearest = np.minimum(np.rint(times * rate).astype(int), len(views) - 1)
+    places = interpolated(np.where((confidence > 0.0)[..., None], places_detected, places_of_figure), rate, times)
     points = figure.all_points(Pose(place, root.as_matrix(), angles), lifted.proportions)[:, FEET]
     speed = np.linalg.norm(np.gradient(points, scene.dt, axis=0), axis=-1)
     standing = (
@@ -145,12 +146,15 @@ class BodyPoints:
         return points + jnp.asarray(self.shoulder_shift, states.dtype)[:, None] * rotations[..., self.torso, None, :, 0]
 
 
-def terms_of(body_points: BodyPoints, camera: Camera, sigma: float, dt: float) -> tuple[CostTerm, ...]:
-    """Return the named cost terms of a candidate."""
+def terms_of(
+    body_points: BodyPoints, cameras: tuple[Camera, ...], sigma: np.ndarray, dt: float
+) -> tuple[CostTerm, ...]:
+    """Return the named cost terms of a candidate; sigma: standard deviation (C,) of each camera's keypoints [px]."""
     feet = np.array(FEET)
 
     def image(states: Array, controls: Array, context: FilmedMotion) -> Array:
-        distances = (camera.project(body_points.points(states)) - context.places) / sigma
+        images = places_in_all(cameras, body_points.points(states))
+        distances = (images - context.places) / jnp.asarray(sigma, states.dtype)[:, None, None]
         return (jnp.sqrt(context.weights)[..., None] * jnp.clip(distances, -30.0, 30.0)).reshape(len(states), -1)
 
     def near(states: Array, controls: Array, context: FilmedMotion) -> Array:
@@ -187,15 +191,15 @@ def terms_of(body_points: BodyPoints, camera: Camera, sigma: float, dt: float) -
 
 
 def planner_of(
-    scene: Scene, body_points: BodyPoints, camera: Camera, sigma: float, dynamics: Dynamics, preset: FitPreset,
-    truth: Dynamics | None = None,
+    scene: Scene, body_points: BodyPoints, cameras: tuple[Camera, ...], sigma: np.ndarray, dynamics: Dynamics,
+    preset: FitPreset, truth: Dynamics | None = None,
 ) -> Planner:  # fmt: skip
     """Return a planner with the costs of `terms_of`.
 
-    sigma: standard deviation of the keypoints [px]. truth: see `FitPreset.optimizers`.
+    sigma: see there. truth: see `FitPreset.optimizers`.
     """
     return Planner(
-        dynamics, terms_of(body_points, camera, sigma, scene.dt), preset.horizon, preset.knots, scene.dt,
+        dynamics, terms_of(body_points, cameras, sigma, scene.dt), preset.horizon, preset.knots, scene.dt,
         SPREAD_SHARE * exploration_std(scene), preset.optimizers(truth), *scene.limits,
     )  # fmt: skip
 

@@ -24,7 +24,8 @@ from tasks.models import ROWS, DynamicsName
 from tasks.pose import figure as figures
 from tasks.pose import lift, physical
 from tasks.pose.checkpoint import PlanningEffort, Progress
-from tasks.pose.points import Keypoints, interpolated
+from tasks.pose.points import interpolated
+from tasks.pose.views import Views
 from viewer import Overlay
 
 # Time step of states and controls [s], as every scene's by default.
@@ -37,17 +38,17 @@ SAVE_INTERVAL = 5.0
 MIN_FRAMES = 10
 
 
-def frames_with_person(keypoints: Keypoints) -> tuple[int, int]:
+def frames_with_person(views: Views) -> tuple[int, int]:
     """Return the first and the last frame in which a person is seen; raises InputError if too few show one."""
-    frames = np.flatnonzero((keypoints.confidence > 0.3).sum(axis=1) >= 6)
+    frames = views.frames_with_person
     if len(frames) < MIN_FRAMES:
         raise InputError(f"keypoints show 6 or more points in {len(frames)} frames, but need {MIN_FRAMES} such frames")
     return int(frames[0]), int(frames[-1])
 
 
-def cut(keypoints: Keypoints) -> Keypoints:
-    """Return the keypoints from the first frame in which a person is seen to the last."""
-    return keypoints.cut(*frames_with_person(keypoints))
+def cut(views: Views) -> Views:
+    """Return the views from the first frame in which a person is seen to the last."""
+    return views.cut(*frames_with_person(views))
 
 
 def angles_of(states: np.ndarray, body: Body, dt: float) -> dict[str, Any]:
@@ -85,7 +86,7 @@ class Reconstruction(NamedTuple):
 
 
 def reconstruct(
-    film: Keypoints,
+    views: Views,
     lifted: lift.Lifted,
     dynamics: DynamicsName = "larp",
     preset: physical.FitPreset = physical.PRESETS["balanced"],
@@ -107,10 +108,9 @@ def reconstruct(
         model = MujocoDynamics(Truth(scene, ROWS, SUBSTEPS))
     else:
         model, truth = Simulator.of_physics(scene), MujocoDynamics(Truth(scene, 1, SUBSTEPS))
-    filmed = physical.filmed_motion(scene, figure, lifted, film)
+    filmed = physical.filmed_motion(scene, figure, lifted, views)
     body_points = physical.BodyPoints(body, figure, lifted.proportions)
-    sigma = lift.noise(film, lifted.camera)
-    planner = physical.planner_of(scene, body_points, lifted.camera, sigma, model, preset, truth)
+    planner = physical.planner_of(scene, body_points, lifted.cameras, views.sigma, model, preset, truth)
     effort, plans_counted, save_time = PlanningEffort() if progress is None else progress.effort, 0, time.monotonic()
 
     def observe(execution: Execution) -> None:
@@ -127,14 +127,14 @@ def reconstruct(
     execution = physical.fit(scene, planner, filmed, state, preset.interval, seed, observe, checkpoint)
     states = np.stack(execution.states)
     points_at_steps = np.asarray(body_points.points(states.astype(np.float32)), float)
-    executed = interpolated(points_at_steps, 1.0 / scene.dt, film.times)
+    executed = interpolated(points_at_steps, 1.0 / scene.dt, views.times)
     start = figure.all_points(lifted.pose, lifted.proportions)
     return Reconstruction(lifted, body, start, executed, filmed, states, effort)
 
 
-def overlay_of(film: Keypoints, result: Reconstruction) -> Overlay:
-    """Return the motion under the keypoints, for a page."""
-    camera = result.lifted.camera
+def overlay_of(views: Views, result: Reconstruction) -> Overlay:
+    """Return the motion under the keypoints of the first film, for a page."""
+    film, camera = views.films[0], result.lifted.cameras[0]
     position, turn = np.asarray(camera.position, float), np.asarray(camera.turn, float)
     depth = (result.executed - position) @ turn[2]
     places = np.where(film.detected[..., None], film.places, np.nan), camera.project(result.executed)
