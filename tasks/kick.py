@@ -80,8 +80,9 @@ def main(
         preset: how much a plan may cost.
         change: fields of the preset to change: interval=2 replan.0.rounds=3 "verify=(4, 2)".
         dynamics: the planner's model: larp or mujoco.
-        reference: a captured kick (BVH, or npz of joint angles) instead of the embedded one.
-        names: JSON object of what the BVH file calls our joints, {"Hips": "pelvis", ...}, which known skeletons do not
+        reference: a captured kick (BVH, npz of joint angles, or joints in space: TRC, C3D, npz) instead of the embedded
+            one.
+        names: JSON object of what the file calls our joints, {"Hips": "pelvis", ...}, which known skeletons do not
             need; and of its conventions, {"up": "z", "unit": "inches", "rest": "T-pose"}, where they are not found.
         weights: manifest of weights that correct larp's physics; none by default.
         height: of the human [m].

@@ -19,6 +19,7 @@ from tasks.episodes.any_motion import any_episodes
 from tasks.episodes.around_kick import random_episodes
 from tasks.episodes.chains import thrown_episodes
 from tasks.motions import references
+from tasks.pose.joint_motion import source_of
 
 # The first n steps over which errors are averaged, as in the paper.
 WINDOWS, CHAIN_WINDOWS = (10, 38, 60), (10, 40, 80, 190)
@@ -98,7 +99,7 @@ def around(chosen: Scenario, reference: Path | None, varied: bool) -> Scenario:
         raise InputError(f"{argument} is asked for, but the scene {chosen.name} has no human")
     if reference is None:
         return replace(chosen, draw=partial(_around_the_kick, chosen.scene, varied=True), paper=())
-    kick = references.captured(reference, _kicking(chosen.scene))
+    kick = references.captured(source_of(reference), _kicking(chosen.scene))
     return replace(chosen, draw=partial(random_episodes, chosen.scene, kick, varied=varied), paper=())
 
 

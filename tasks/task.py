@@ -37,6 +37,7 @@ from tasks.motions import references
 from tasks.motions.joint_names import names_in
 from tasks.motions.references import Reference
 from tasks.motions.skeleton import Motion
+from tasks.pose.joint_motion import source_of
 from tasks.presets import usable
 from tasks.residuals import Context
 
@@ -111,7 +112,8 @@ class Task(ABC):
         if isinstance(reference, Reference):
             return cls(scene, reference, substeps)
         joint_names = None if names is None else names_in(Path(names))
-        return cls(scene, references.captured(reference, scene, names=joint_names), substeps)
+        source = source_of(reference, joint_names)
+        return cls(scene, references.captured(source, scene, names=joint_names), substeps)
 
     @abstractmethod
     def check(self, goal: Any) -> Any:

@@ -125,7 +125,7 @@ def test_a_film_by_a_camera_that_follows_the_person_is_told_of(
 
 def test_what_was_kept_of_another_film_or_is_damaged_is_of_no_use(film: dict[str, Any], tmp_path: Path) -> None:
     path = tmp_path / "unfinished.npz"
-    found = lift.Lifted(figures.Pose(*(np.zeros(2),) * 3), np.zeros(11), (film["lens"],), 1.0)
+    found = lift.Lifted(figures.Pose(*(np.zeros(2),) * 3), np.zeros(11), np.zeros(3), 1.0)
     Progress(path, "one").save(found)
     again = Progress(path, "one")
     assert again.lifted is not None and again.lifted.error == 1.0 and again.checkpoint is None
@@ -145,7 +145,7 @@ def test_frames_at_the_ends_in_which_nobody_is_seen_are_left_out(film: dict[str,
     whole = film["keypoints"]
     hidden = Keypoints(whole.places.copy(), whole.confidence.copy(), whole.rate, whole.size)
     hidden.confidence[:3], hidden.confidence[-5:] = 0.0, 0.0
-    (left,) = reconstruction.cut(Views((hidden,), (film["lens"],))).films
+    (left,) = Views((hidden,), (film["lens"],)).with_person().films
     assert len(left) <= len(whole) - 8
     np.testing.assert_array_equal(left.places[-1], whole.places[len(whole) - 6])
 
@@ -232,4 +232,4 @@ def test_a_benchmark_that_makes_no_sense_is_refused(arguments: dict[str, Any], s
 
 def test_too_few_frames_are_refused(film: dict[str, Any]) -> None:
     with pytest.raises(InputError, match="6 or more points in 5 frames, but need 10"):
-        reconstruction.cut(Views((film["keypoints"].cut(0, 4),), (film["lens"],)))
+        Views((film["keypoints"].cut(0, 4),), (film["lens"],)).with_person()

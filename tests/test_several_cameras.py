@@ -18,12 +18,12 @@ from tasks.motions.references import embedded
 from tasks.pose import camera as cameras
 from tasks.pose import figure as figures
 from tasks.pose import lift, metrics, physical, sources, synthetic_film
-from tasks.pose.camera import Camera, places_in_all
+from tasks.pose.camera import Camera
 from tasks.pose.figure import SHARED
 from tasks.pose.points import POINTS, Keypoints, interpolated
 from tasks.pose.synchronisation import match, resampled, synchronised
 from tasks.pose.triangulation import triangulated
-from tasks.pose.views import Views
+from tasks.pose.views import Views, places_in_all
 
 SIZE = synthetic_film.SIZE
 seeds = st.integers(0, 2**31)
@@ -173,7 +173,7 @@ class TestFiles:
         assert "left_side.npz: camera left" in loaded.notes and "right_side.npz: camera right" in loaded.notes
         assert any(note.startswith("right_side.npz: person 0, began 0.") for note in loaded.notes)
         assert loaded.position_known and len(loaded.views.films) == 2
-        np.testing.assert_allclose(loaded.views.cameras[1].position, films["right"].position, atol=1e-9)
+        np.testing.assert_allclose(loaded.views.as_images()[1][1].position, films["right"].position, atol=1e-9)
         np.testing.assert_array_equal(loaded.views.times, np.arange(len(loaded.views)) / 50.0)
 
     def test_cameras_can_be_named_or_are_taken_in_order(self, films: dict[str, Any]) -> None:
@@ -181,7 +181,7 @@ class TestFiles:
         named = sources.load(films["paths"], camera_files=[Path(f"{file}:{name}") for name in ("left", "right")])
         renamed = [path.rename(folder / f"{number}.npz") for number, path in enumerate(films["paths"])]
         in_order = sources.load(renamed[::-1], camera_files=(file,))
-        np.testing.assert_array_equal(named.views.cameras[0].position, in_order.views.cameras[1].position)
+        np.testing.assert_array_equal(named.views.as_images()[1][0].position, in_order.views.as_images()[1][1].position)
 
     def test_a_film_that_ends_midway_is_said_to_show_less(self, films: dict[str, Any], kick: np.ndarray) -> None:
         short = film_of(films["right"], kick, 50.0, 0.3, 1)

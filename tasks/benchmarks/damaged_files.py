@@ -10,6 +10,7 @@ import json
 import re
 import resource
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from contextlib import chdir
 from dataclasses import dataclass, fields, is_dataclass
@@ -18,6 +19,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import c3d
 import mujoco
 import numpy as np
 from rich.table import Table
@@ -35,7 +37,8 @@ from tasks.command import run
 from tasks.kick import Kick
 from tasks.live import load_recording
 from tasks.motions import angles, bvh, key_poses
-from tasks.pose import camera, formats, safe_pickle
+from tasks.pose import camera, formats, joint_files, safe_pickle
+from tasks.pose.figure import SHARED, Pose, figure
 from tasks.pose.points import POINTS
 
 # Files of a job, after which a run that was cut off goes on.
@@ -141,6 +144,35 @@ def _write_kept_kick(folder: Path, kick: Kick) -> None:
     np.savez(folder / "kick.npz", states=states, predicted_states=states[1:], plan_step=np.array(0))
 
 
+def _joint_places() -> np.ndarray:
+    """Return places (8, P, 3) [m] of somebody who stands."""
+    pose = Pose(np.full((8, 3), (0.0, 0.0, 1.0)), np.tile(np.eye(3), (8, 1, 1)), np.zeros((8, figure().joints, 3)))
+    return figure().all_points(pose, np.zeros(SHARED))
+
+
+def _write_trc(folder: Path) -> None:
+    labels = "\t\t\t".join(POINTS)
+    head = f"PathFileType\t4\t(X/Y/Z)\tjoints.trc\nDataRate\tUnits\n60\tm\nFrame#\tTime\t{labels}\n\tX1\n"
+    rows = [
+        f"{frame}\t{frame / 60.0:.3f}\t" + "\t".join(f"{value:.4f}" for value in places.ravel())
+        for frame, places in enumerate(_joint_places())
+    ]
+    _write_text(folder / "joints.trc", head + "\n".join(rows) + "\n")
+
+
+def _write_c3d(folder: Path) -> None:
+    writer = c3d.Writer(point_rate=60.0, point_units="m   ", point_scale=-1.0)
+    writer.add_frames([(np.pad(places, ((0, 0), (0, 2))), np.zeros((0, 1))) for places in _joint_places()])
+    writer.set_point_labels(list(POINTS))
+    with (folder / "joints.c3d").open("wb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that there is nothing but points
+        writer.write(file)
+
+
+def _write_joints(folder: Path) -> None:
+    np.savez(folder / "joints.npz", names=np.array(POINTS), positions=_joint_places(), rate=np.array(60.0))
+
+
 def _write_pickle(folder: Path) -> None:
     (folder / "dance.pkl").write_bytes(np.arange(600.0).reshape(100, 3, 2).dumps())
 
@@ -173,6 +205,9 @@ def kinds() -> dict[str, FileKind]:
         "camera, JSON": FileKind(_write_camera, "camera.json", camera.load),
         "camera, YAML": FileKind(_write_opencv_lens, "lens.yml", camera.load),
         "camera, TOML": FileKind(_write_pose2sim_camera, "calib.toml", camera.load),
+        "joints, TRC": FileKind(_write_trc, "joints.trc", joint_files.load),
+        "joints, C3D": FileKind(_write_c3d, "joints.c3d", joint_files.load),
+        "joints, npz": FileKind(_write_joints, "joints.npz", joint_files.load),
         "key poses": FileKind(partial(_copy, key_poses.FILE), key_poses.FILE.name, key_poses.load),
         "kept kick, arrays": FileKind(
             partial(_write_kept_kick, kick=kick), "kick.npz", lambda path: load_recording(kick, path.parent)
@@ -259,7 +294,10 @@ def is_finite(value: Any, depth: int = 0) -> bool:
 
 
 # Where not a number says that nothing was detected; and what reads any arrays.
-ANY_NUMBERS = ("keypoints, npz", "keypoints, JSON", "keypoints, labels", "pickled arrays", "kept kick, arrays")
+ANY_NUMBERS = (
+    *("keypoints, npz", "keypoints, JSON", "keypoints, labels", "joints, TRC", "joints, C3D", "joints, npz"),
+    *("pickled arrays", "kept kick, arrays"),
+)
 
 
 def read_damaged(name: str, count: int, seed: int) -> report.Row:

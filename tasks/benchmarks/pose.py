@@ -25,11 +25,10 @@ from tasks.motions.references import embedded, motion_of
 from tasks.pose import aist as dances
 from tasks.pose import figure as figures
 from tasks.pose import lift, metrics, physical, synthetic_film
-from tasks.pose.camera import places_in_all
 from tasks.pose.figure import SHARED
 from tasks.pose.points import interpolated
-from tasks.pose.reconstruction import frames_with_person, reconstruct
-from tasks.pose.views import Views
+from tasks.pose.reconstruction import reconstruct
+from tasks.pose.views import Views, places_in_all
 from tasks.presets import PresetName
 
 # Frame rate of a synthetic film [1/s], and the share of it before a kick's strike.
@@ -172,13 +171,13 @@ def film_of_dance(folder: Path, sequence: str, camera: int, seconds: float) -> F
     keypoints, lens, true = dances.load(folder, sequence, camera)
     excerpt = Views((keypoints.cut(0, round(seconds * keypoints.rate) - 1),), (lens,))
     try:
-        first, last = frames_with_person(excerpt)
+        views = excerpt.with_person()
     except InputError as error:
         raise InputError(f"sequences has {name!r}, whose {error}") from None
-    true = true[first : last + 1]
+    true = true[excerpt.frames_with_person[0] :][: len(views)]
     if np.isnan(metrics.pelvis(true)).any(axis=(1, 2)).all():
         raise InputError(f"sequences has {name!r}, of which no frame has both hips")
-    return Film(name, excerpt.cut(first, last), true)
+    return Film(name, views, true)
 
 
 def dances_of(folder: Path, names: Sequence[str], cameras: int, seconds: float) -> dict[str, Callable[[], Film]]:
@@ -221,7 +220,7 @@ def row_of_film(film: Callable[[], Film], ways: Sequence[Way], preset: physical.
 
     row: dict[str, Any] = {
         "clip": name,
-        "cameras_m": [camera.position.tolist() for camera in views.cameras],
+        "cameras_m": [camera.position.tolist() for camera in views.as_images()[1]],
         "frames": len(views),
     }
     if not math.isnan(skate := metrics.foot_skate(true)):

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from larp_model.errors import InputError
 from larp_model.names import require_known
+from larp_model.rotation import from_rotation_vector, matrix
 from tasks.pose.calibration import fields_of
 from tasks.pose.points import Keypoints
 
 # Horizontal field of view of a phone's camera [degrees] and its height [m], where the file has neither.
 FIELD_OF_VIEW, HANDHELD_HEIGHT = 65.0, 1.4
 FIELDS = ("size", "field_of_view", "focal", "centre", "distortion", "position", "look_at", "rotation")
+# Standard deviation of a detector's points, as a share of the image's larger side.
+PIXEL_STD = 0.004
 # Largest error of places whose distortion is removed, in focal lengths; beyond, a lens distorts too much there.
 UNDISTORTED = 1e-3
 
@@ -53,10 +56,27 @@ class Camera:
         rays: np.ndarray = np.concatenate([(places - self.centre) / self.focal, ahead], axis=-1) @ self.turn
         return rays
 
+    def tilted(self, corrections: Any) -> Camera:
+        """Return the camera with pitch, roll [rad] and the logarithm of its height changed by (3,) values."""
+        turn = matrix(from_rotation_vector(jnp.stack([corrections[0], jnp.zeros(()), corrections[1]])))
+        position = jnp.asarray(self.position) * jnp.stack([1.0, 1.0, jnp.exp(corrections[2])])
+        return Camera(self.focal, jnp.asarray(self.centre), turn @ jnp.asarray(self.turn), position)
 
-def places_in_all(cameras: Sequence[Camera], points: Any) -> Any:
-    """Return places (*, C, P, 2) [px] of points (*, P, 3) [m] in the images of C cameras."""
-    return points.__array_namespace__().stack([camera.project(points) for camera in cameras], axis=-3)
+    def noise(self, size: tuple[float, float] | None) -> float:
+        """Return the standard deviation [px] of a detector's points in images of a size [px], by default its own."""
+        return PIXEL_STD * float(max(size or 2.0 * np.asarray(self.centre)))
+
+    def placed(self, places: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return the translations (S, 3) [m] that move points (S, N, 3) so that they are as large as places (N, 2)."""
+        local = points @ self.turn.T
+        spread = np.sqrt(local[..., :2].var(axis=1).sum(axis=-1))
+        depth = np.clip(self.focal * spread / max(np.sqrt(places.var(axis=0).sum()), 1.0), 1.0, 60.0)
+        translations: np.ndarray = self.position + depth[:, None] * self.ray(places.mean(axis=0)) - points.mean(axis=1)
+        return translations
+
+    def image_of(self, film: Keypoints) -> tuple[Keypoints, Camera]:
+        """Return the film and the camera, as its keypoints are already those of an image."""
+        return film, self
 
 
 def looking_at(position: np.ndarray, target: np.ndarray, focal: float, size: tuple[float, float]) -> Camera:

@@ -13,11 +13,8 @@ import numpy as np
 from larp_model.files import write_whole
 from mpc import Plan, PlanInfo
 from mpc.loop import Checkpoint
-from tasks.pose.camera import Camera
 from tasks.pose.figure import Pose
 from tasks.pose.lift import Lifted
-
-_CAMERA = ("focal", "centre", "turn", "position")
 
 
 class PlanningEffort(NamedTuple):
@@ -75,7 +72,7 @@ class Progress:
         content: dict[str, Any] = {
             "made_by": self._inputs,
             **{f"pose_{name}": value for name, value in lifted.pose._asdict().items()},
-            **{f"camera_{name}": np.stack([getattr(camera, name) for camera in lifted.cameras]) for name in _CAMERA},
+            "corrections": lifted.corrections,
             "proportions": lifted.proportions,
             "error": lifted.error,
             "spent": np.array(effort, float),
@@ -95,11 +92,11 @@ class Progress:
         def values_of(kind: str, fields: tuple[str, ...]) -> Iterator[np.ndarray]:
             return (arrays[f"{kind}_{name}"] for name in fields)
 
-        cameras = tuple(
-            Camera(float(focal), *others) for focal, *others in zip(*values_of("camera", _CAMERA), strict=True)
-        )
         self.lifted = Lifted(
-            Pose(*values_of("pose", Pose._fields)), arrays["proportions"], cameras, float(arrays["error"])
+            Pose(*values_of("pose", Pose._fields)),
+            arrays["proportions"],
+            arrays["corrections"],
+            float(arrays["error"]),
         )
         seconds, compiling, *counts = arrays["spent"].tolist()
         self.effort = PlanningEffort(seconds, compiling, *map(int, counts))

@@ -7,6 +7,7 @@ import json as text
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import jax
 import numpy as np
 import tyro
 from rich.table import Table
@@ -18,19 +19,19 @@ from tasks.models import DynamicsName
 from tasks.motions import angles, bvh
 from tasks.pose import figure as figures
 from tasks.pose import lift, metrics, physical, sources
-from tasks.pose.camera import places_in_all
+from tasks.pose.camera import Camera
 from tasks.pose.checkpoint import Progress, fingerprint
 from tasks.pose.lift import Lifted
 from tasks.pose.picture import pose_picture
-from tasks.pose.reconstruction import DT, Reconstruction, angles_of, cut, overlay_of, reconstruct
-from tasks.pose.views import Views
+from tasks.pose.reconstruction import DT, Reconstruction, angles_of, overlay_of, reconstruct
+from tasks.pose.views import Views, places_in_all
 from tasks.presets import PresetName
 from viewer import write_overlay
 
 # Heights of people [m].
 HEIGHTS = 1.3, 2.2
-# A median error [share of the image] beyond which the figure does not fit the person.
-MAX_MEDIAN_ERROR = 0.03
+# A median error, in standard deviations of the points, beyond which the figure does not fit the person.
+MAX_MEDIAN_ERROR = 7.5
 # Feet slip less than this in films of a camera that stands still [m/s].
 MAX_SLIP = 0.12
 
@@ -52,31 +53,37 @@ def lifted_of(views: Views, position_known: bool, height: float | None, progress
 
 def slip_of(views: Views, lifted: Lifted, teller: Teller) -> float:
     """Return the slip of the kinematic start [m/s], and warn where it, or the fit, shows that the camera moves."""
-    if lifted.error > MAX_MEDIAN_ERROR * 2.0 * np.max(views.cameras[0].centre):
-        teller(
-            f"half of the points are more than {lifted.error:.0f} px off: does the camera move, or is it another one?"
-        )
+    if lifted.error > MAX_MEDIAN_ERROR * views.sigma.max():
+        cause = "is it no person?" if views.in_space else "does the camera move, or is it another one?"
+        teller(f"half of the points are more than {length_of(lifted.error, views)} off: {cause}")
     slip = metrics.slip(figures.figure().all_points(lifted.pose, lifted.proportions), views.rate)
     if slip > MAX_SLIP:
         teller(f"the feet slip, by {slip:.2f} m/s where they ought to stand: does the camera move, or the ground?")
     return slip
 
 
-def summary_of(views: Views, result: Reconstruction, slip: float) -> dict[str, Any]:
+def length_of(distance: float, views: Views) -> str:
+    """Return a distance [px or m] between points, as text."""
+    return f"{1e3 * distance:.0f} mm" if views.in_space else f"{distance:.1f} px"
+
+
+def summary_of(result: Reconstruction, slip: float) -> dict[str, Any]:
     """Return the figures of a reconstruction, entries of `summary.json`. slip: see `metrics.slip` [m/s]."""
-    lifted, effort = result.lifted, result.effort
-    distances = np.linalg.norm(places_in_all(lifted.cameras, result.executed) - views.places, axis=-1)
+    views, lifted, effort = result.views, result.lifted, result.effort
+    distances = np.linalg.norm(places_in_all(views.cameras, result.executed) - views.places, axis=-1)
+    scale, unit = (1e3, "mm") if views.in_space else (1.0, "px")
+    cameras = [camera for camera in views.cameras if isinstance(camera, Camera)]
     return {
         "films": len(views.films),
         "frames": len(views),
         "rate": views.rate,
         "height_m": float(figures.figure().height(np.asarray(lifted.proportions))),
-        "cameras_m": [np.asarray(camera.position, float).tolist() for camera in lifted.cameras],
-        "focals_px": [float(camera.focal) for camera in lifted.cameras],
-        "kinematic_error_px": lifted.error,
+        "cameras_m": [np.asarray(camera.position, float).tolist() for camera in cameras],
+        "focals_px": [float(camera.focal) for camera in cameras],
+        f"kinematic_error_{unit}": scale * lifted.error,
         "slip_m_s": slip,
         "camera_seems_to_move": slip > MAX_SLIP,
-        "error_px": float(np.nanmedian(distances)),
+        f"error_{unit}": scale * float(np.nanmedian(distances)),
         "fell": result.fell,
         "plan_seconds": effort.seconds,
         "compile_seconds": effort.compile_seconds,
@@ -88,28 +95,30 @@ def summary_of(views: Views, result: Reconstruction, slip: float) -> dict[str, A
 
 def table_of(summary: dict[str, Any]) -> Table:
     """Return the summary as a table for display."""
+    unit = "px" if "error_px" in summary else "mm"
+    error, error_before = (f"{summary[f'{name}_{unit}']:.1f} {unit}" for name in ("error", "kinematic_error"))
     table = Table("", "", title="Motion from keypoints", show_header=False)
     films = "" if summary["films"] == 1 else f" of {summary['films']} films"
     table.add_row("frames", f"{summary['frames']}{films}, {summary['frames'] / summary['rate']:.1f} s")
     table.add_row("height of the person", f"{summary['height_m']:.2f} m")
     table.add_row(
         "points off, half of them by less than",
-        f"{summary['error_px']:.1f} px ({summary['kinematic_error_px']:.1f} px before physics)",
+        f"{error} ({error_before} before physics)",
     )
     table.add_row("fell", "yes" if summary["fell"] else "no")
     table.add_row("planning", f"{summary['plan_seconds']:.1f} s, {summary['candidates']} candidates")
     return table
 
 
-def write(folder: Path, views: Views, result: Reconstruction, summary: dict[str, Any]) -> None:
+def write(folder: Path, result: Reconstruction, summary: dict[str, Any]) -> None:
     """Write the motion, its pictures and, last, `summary.json`; of a human who fell, the kinematic start."""
     buffer = io.BytesIO()
     motion = angles_of(result.filmed.states if result.fell else result.states, result.body, DT)
     np.savez_compressed(buffer, **motion)
     write_whole(folder / "pose.npz", buffer.getvalue())
     write_whole(folder / "pose.bvh", bvh.dumps(angles.motion(**motion)).encode())
-    pose_picture(views, result.lifted.cameras, result.executed, result.start, folder / "pose.png")
-    write_overlay(overlay_of(views, result), folder / "pose.html")
+    pose_picture(result.views, result.executed, result.start, folder / "pose.png")
+    write_overlay(overlay_of(result), folder / "pose.html")
     write_whole(folder / "summary.json", (text.dumps(summary, indent=2) + "\n").encode())
 
 
@@ -129,11 +138,11 @@ def main(
     quiet: bool = False,
     json: bool = False,
 ) -> None:
-    """Motion in 3D from the 2D keypoints of films. A run that was cut off goes on where it was.
+    """Motion in MuJoCo from the keypoints of films, or from joints. A run that was cut off goes on where it was.
 
     Args:
         keypoints: of OpenPose (a folder), AlphaPose, MMPose, MediaPipe or YOLO (JSON, or a folder of labels), or npz;
-            of several cameras one each. The films may begin at different times.
+            of several cameras one each. The films may begin at different times. Or joints in space: TRC, C3D or npz.
         rate: frames a second of the film, where the file does not say; of several films one number, or each one's.
         cameras: file of the camera, which stands still: a calibration of OpenCV (YAML, JSON), EasyMocap, Pose2Sim
             (TOML) or COLMAP, as FILE:NAME where it has several; or JSON with field_of_view (degrees) or focal (px),
@@ -157,16 +166,16 @@ def main(
         raise InputError(f"height is {height:g}, but must be from {HEIGHTS[0]:g} to {HEIGHTS[1]:g} m")
     require_writable(out, "out")
     loaded = sources.load(keypoints, rate, size, person, points, cameras, turned)
-    views = cut(loaded.views)
+    views = loaded.views.with_person()
     prepare_jax()
     teller = Teller(quiet, json)
     for note in loaded.notes:
         teller(note)
     if loaded.crossed:
         teller(f"another person is before or behind this one in {loaded.crossed} frames: look at them in pose.png")
-    camera_inputs = [(one.focal, *one.centre, *one.turn.ravel(), *one.position) for one in views.cameras]
+    camera_inputs = [np.ravel(value) for value in jax.tree.leaves(views.cameras)]
     other_inputs = loaded.position_known, height or 0.0, dynamics, repr(physical.PRESETS[preset]), seed
-    inputs = fingerprint(views.places, views.confidence, views.rate, camera_inputs, *other_inputs)
+    inputs = fingerprint(views.places, views.confidence, views.rate, *camera_inputs, *other_inputs)
     progress = Progress(out / "unfinished.npz", inputs)
     lifted = lifted_of(views, loaded.position_known, height, progress, teller)
     slip = slip_of(views, lifted, teller)
@@ -174,13 +183,13 @@ def main(
         result = reconstruct(views, lifted, dynamics, physical.PRESETS[preset], seed, progress, on_step)
     if result.fell:
         teller("the human fell: pose.npz and pose.bvh hold the kinematic start instead, which no physics has seen")
-    summary = summary_of(views, result, slip) | {
+    summary = summary_of(result, slip) | {
         "people": loaded.people,
         "crossed": loaded.crossed,
         "read": loaded.notes,
     }
     summary |= {"dynamics": dynamics, "preset": preset, "seed": seed}
-    write(out, views, result, summary)
+    write(out, result, summary)
     progress.delete()
     teller.result(table_of(summary), summary)
     teller(f"{out}/: summary.json, pose.npz, pose.bvh, pose.png, pose.html")

@@ -30,14 +30,13 @@ from scipy.spatial.transform import Rotation
 from larp_model.errors import InputError
 from mpc.damping import next_damping
 from tasks.pose.banded import Banded
-from tasks.pose.camera import Camera, places_in_all
 from tasks.pose.figure import SHARED, SOLE_HEIGHT, USUAL_HEIGHT, Figure, Pose, figure
-from tasks.pose.image import HEIGHT_STD, ROLL_STD, SHARED_VALUES, TILT_STD, estimated_camera, points_and_places
+from tasks.pose.image import HEIGHT_STD, ROLL_STD, SHARED_VALUES, TILT_STD, points_and_places
 from tasks.pose.per_frame import PerFrameFit
 from tasks.pose.points import FEET, POINTS, SIDES
 from tasks.pose.prior import prior_residuals
 from tasks.pose.rows import by_rows, single
-from tasks.pose.views import Views
+from tasks.pose.views import Viewpoint, Views, places_in_all
 
 # Standard deviation of the body's size, as a share.
 SIZE_STD = 0.06
@@ -73,20 +72,21 @@ _SWAPS = (
 class Lifted(NamedTuple):
     """Figure fitted to all frames.
 
-    pose: see `figure.Pose`. proportions: (11,), see `Figure`. cameras: the films', or as estimated. error: median
-    reprojection error of the detected points [px].
+    pose: see `figure.Pose`. proportions: (11,), see `Figure`. corrections: (3,) of the camera, see
+    `Camera.tilted`, zeros where its position is known. error: median distance of the detected points [px or m].
     """
 
     pose: Pose
     proportions: np.ndarray
-    cameras: tuple[Camera, ...]
+    corrections: np.ndarray
     error: float
 
 
 class PoseQuantities(NamedTuple):
     """Quantities that follow from a pose and the shared values.
 
-    points: (T, P, 3) [m]. places: (T, C, P, 2) [px]. prior: its residuals (T, K). heights: of the soles (T, 4) [m].
+    points: (T, P, 3) [m]. places: (T, C, P, 2 or 3) [px or m]. prior: its residuals (T, K). heights: of the soles
+    (T, 4) [m].
     """
 
     points: np.ndarray
@@ -201,13 +201,13 @@ class _FilmFit:
         of_points, of_places, of_prior = self.derivatives(pose, shared)
         frame_weight = 30.0 / rate  # neighbouring frames at a high frame rate add little information
         is_detected = (confidence > 0.0)[..., None]
-        pixels = np.repeat(self.views.sigma, 2 * len(POINTS))
+        scale = np.repeat(self.views.sigma, places[0, 0].size)[:, None]
 
         def image(quantities: PoseQuantities) -> np.ndarray:
             residuals: np.ndarray = np.where(is_detected, quantities.places - np.nan_to_num(places), 0.0) / self.sigma
             return residuals.reshape(frames, -1)
 
-        image_residuals = image(quantities).reshape(*confidence.shape, 2)
+        image_residuals = image(quantities).reshape(places.shape)
         image_weights = frame_weight * confidence / (1.0 + (image_residuals**2).sum(axis=-1) / OUTLIER**2) ** 2
         scales = np.array([ACCELERATIONS.get(name.partition("_")[2], TRUNK_ACCELERATION) for name in POINTS]) / rate**2
         acceleration_weights = (
@@ -228,7 +228,7 @@ class _FilmFit:
         of_heights[:, [1, 3], -1] -= 1.0
         return [
             ResidualTerm(
-                np.repeat(image_weights.reshape(frames, -1), 2, axis=1), image, ((0, of_places / pixels[:, None]),)
+                np.repeat(image_weights.reshape(frames, -1), places.shape[-1], axis=1), image, ((0, of_places / scale),)
             ),
             ResidualTerm(
                 np.repeat(acceleration_weights, 3, axis=1),
@@ -294,7 +294,7 @@ class _FilmFit:
     def derivatives(self, pose: Pose, shared: np.ndarray) -> list[np.ndarray]:
         """Return derivatives by pose and shared values.
 
-        They are those of points (T, 3 P, D + S), places (T, 2 C P, D + S) and prior residuals (T, K, D + S).
+        They are those of points (T, 3 P, D + S), places (T, 2 C P or 3 P, D + S) and prior residuals (T, K, D + S).
         """
         stacked = self.by_frames(_all_derivatives, pose, shared)
         return [derivatives.reshape(len(derivatives), -1, derivatives.shape[-1]) for derivatives in stacked]
@@ -310,14 +310,14 @@ class _FilmFit:
 
 
 def _frame_quantities(
-    body: Figure, cameras: tuple[Camera, ...], turn: Array, change: Array, shared: Array
+    body: Figure, cameras: tuple[Viewpoint, ...], turn: Array, change: Array, shared: Array
 ) -> tuple[Array, ...]:
-    """Return points (P, 3) [m] of one frame, their places (C, P, 2) [px], and the prior residuals (K,) of its pose."""
+    """Return points (P, 3) [m] of one frame, their places (C, P, 2 or 3), and the prior residuals (K,) of its pose."""
     return *points_and_places(body, cameras, turn, change, shared), prior_residuals(body, turn, change)
 
 
 def _frame_derivatives(
-    body: Figure, cameras: tuple[Camera, ...], turn: Array, change: Array, shared: Array
+    body: Figure, cameras: tuple[Viewpoint, ...], turn: Array, change: Array, shared: Array
 ) -> tuple[Array, ...]:
     """Return the derivatives of `_frame_quantities` by change and shared values (D + S,), on their last axis."""
     by_argument = jax.jacfwd(_frame_quantities, (3, 4))(body, cameras, turn, change, shared)
@@ -353,7 +353,7 @@ def lift(views: Views, position_known: bool = True, height: float | None = None)
         raise InputError(f"cameras are {len(views.cameras)}, whose positions are not all known, but must be")
     film_fit = _FilmFit(views, position_known, height)
     pose, shared = film_fit.solve()
-    cameras = views.cameras if position_known else (estimated_camera(views.cameras[0], shared),)
+    corrections = np.zeros(3) if position_known else shared[SHARED : SHARED + 3]
     points = figure().all_points(pose, shared[:SHARED])
-    distances = np.linalg.norm(places_in_all(cameras, points) - views.places, axis=-1)
-    return Lifted(pose, shared[:SHARED], cameras, float(np.nanmedian(distances)))
+    distances = np.linalg.norm(places_in_all(views.corrected(corrections).cameras, points) - views.places, axis=-1)
+    return Lifted(pose, shared[:SHARED], corrections, float(np.nanmedian(distances)))

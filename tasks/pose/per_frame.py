@@ -18,13 +18,12 @@ import numpy as np
 from jax import Array
 from scipy.spatial.transform import Rotation, Slerp
 
-from tasks.pose.camera import Camera
 from tasks.pose.figure import SHARED, SOLE_HEIGHT, Figure, Pose, figure
-from tasks.pose.image import TILT_STD, estimated_camera, points_and_places
+from tasks.pose.image import TILT_STD, points_and_places
 from tasks.pose.points import FEET, POINTS
 from tasks.pose.prior import INITIAL_POSES, prior_residuals, usual_poses
 from tasks.pose.rows import by_rows, single
-from tasks.pose.views import Views
+from tasks.pose.views import Viewpoint, Views
 
 # Frames per second that are solved alone, initial headings of each, and steps of the solver.
 FRAME_RATE, HEADINGS, STEPS = 12.0, 12, 12
@@ -65,7 +64,7 @@ class PerFrameFit:
 
         The distance from the camera follows from the size of the person in the image that shows most points.
         """
-        cameras = [estimated_camera(camera, shared) for camera in self.views.cameras]
+        views = self.views.corrected(shared[SHARED : SHARED + 3])
         headings = np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False)
         turns = np.repeat(Rotation.from_rotvec(headings[:, None] * (0.0, 0.0, 1.0)).as_matrix(), INITIAL_POSES, axis=0)
         angles = np.tile(self.usual_angles, (HEADINGS, 1, 1))
@@ -73,14 +72,11 @@ class PerFrameFit:
         points_at_origin = self.figure.all_points(pose, shared[:SHARED])
         guesses = np.zeros((len(frames), len(turns), 6 + 3 * self.figure.joints))
         for row, frame in enumerate(frames):
-            view = int(self.views.confidence[frame].sum(axis=-1).argmax())
-            camera, film = cameras[view], self.views.films[view]
-            is_detected, local = film.detected[frame], points_at_origin @ camera.turn.T
-            places = film.places[frame, is_detected]
-            spread = np.sqrt(local[:, is_detected, :2].var(axis=1).sum(axis=-1))
-            depth = np.clip(camera.focal * spread / max(np.sqrt(places.var(axis=0).sum()), 1.0), 1.0, 60.0)
-            ray = camera.ray(places.mean(axis=0))
-            guesses[row, :, :3] = camera.position + depth[:, None] * ray - points_at_origin[:, is_detected].mean(axis=1)
+            view = int(views.confidence[frame].sum(axis=-1).argmax())
+            is_detected, camera = views.films[view].detected[frame], views.cameras[view]
+            guesses[row, :, :3] = camera.placed(
+                views.films[view].places[frame, is_detected], points_at_origin[:, is_detected]
+            )
         guesses[:, :, 6:] = angles.reshape(len(angles), -1)
         return np.broadcast_to(turns, (len(frames), *turns.shape)), guesses
 
@@ -187,7 +183,7 @@ def _interpolated_pose(frames: np.ndarray, changes: np.ndarray, turns: np.ndarra
 
 
 def _residuals(
-    body: Figure, cameras: tuple[Camera, ...], sigma: Array, shared: Array,
+    body: Figure, cameras: tuple[Viewpoint, ...], sigma: Array, shared: Array,
     turn: Array, places: Array, weights: Array, change: Array,
 ) -> Array:  # fmt: skip
     """Return the residuals of one frame with places (C, P, 2) [px] of weights (C, P); see `image.points_and_places`."""
@@ -198,7 +194,7 @@ def _residuals(
 
 
 def _solved(
-    body: Figure, cameras: tuple[Camera, ...], sigma: Array, shared: Array, free: Array,
+    body: Figure, cameras: tuple[Viewpoint, ...], sigma: Array, shared: Array, free: Array,
     turn: Array, places: Array, weights: Array, change: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Return a change (D,) and its cost after `STEPS` Levenberg-Marquardt steps; free: (D,) 1 where it may change."""

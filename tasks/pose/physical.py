@@ -33,11 +33,10 @@ from mpc.loop import Checkpoint, Execution, Phase, execute
 from tasks.exploration import exploration_std
 from tasks.motions.references import clearance, with_angular_velocities, with_servo_lead
 from tasks.motions.skeleton import sampled_times
-from tasks.pose.camera import Camera, places_in_all
 from tasks.pose.figure import Figure, Pose
 from tasks.pose.lift import OUTLIER, STANDING_SPEED, Lifted
 from tasks.pose.points import FEET, POINTS, interpolated
-from tasks.pose.views import Views
+from tasks.pose.views import Viewpoint, Views, places_in_all
 from tasks.presets import PresetName
 
 # Spread of a first plan, as a share of the training data's spread around its motions.
@@ -76,7 +75,7 @@ PRESETS: dict[PresetName, FitPreset] = {
 class FilmedMotion(NamedTuple):
     """Motion that a film shows, at each of N steps.
 
-    states (N, L, 13) and targets (N, J, 3) [rad] of the kinematic start; places (N, C, P, 2) [px] and weights (N, C, P)
+    states (N, L, 13) and targets (N, J, 3) [rad] of the kinematic start; places (N, C, P, 2 or 3) and weights (N, C, P)
     of the keypoints of C cameras; standing (N, 4), from 0 to 1, how likely heels and toes stand.
     """
 
@@ -102,7 +101,7 @@ def filmed_motion(scene: Scene, figure: Figure, lifted: Lifted, views: Views) ->
     states = closed(scene, with_angular_velocities(states, scene.dt))
 
     places_detected, confidence = np.nan_to_num(views.places), views.confidence
-    places_of_figure = places_in_all(lifted.cameras, figure.all_points(lifted.pose, lifted.proportions))
+    places_of_figure = places_in_all(views.cameras, figure.all_points(lifted.pose, lifted.proportions))
     distances = np.linalg.norm(places_of_figure - places_detected, axis=-1) / views.sigma[:, None]
     weights = confidence / (1.0 + (distances / OUTLIER) ** 2) ** 2
     nearest = np.minimum(np.rint(times * rate).astype(int), len(views) - 1)
@@ -147,9 +146,9 @@ class BodyPoints:
 
 
 def terms_of(
-    body_points: BodyPoints, cameras: tuple[Camera, ...], sigma: np.ndarray, dt: float
+    body_points: BodyPoints, cameras: tuple[Viewpoint, ...], sigma: np.ndarray, dt: float
 ) -> tuple[CostTerm, ...]:
-    """Return the named cost terms of a candidate; sigma: standard deviation (C,) of each camera's keypoints [px]."""
+    """Return the named cost terms of a candidate; sigma: standard deviation (C,) of each camera's keypoints."""
     feet = np.array(FEET)
 
     def image(states: Array, controls: Array, context: FilmedMotion) -> Array:
@@ -191,7 +190,7 @@ def terms_of(
 
 
 def planner_of(
-    scene: Scene, body_points: BodyPoints, cameras: tuple[Camera, ...], sigma: np.ndarray, dynamics: Dynamics,
+    scene: Scene, body_points: BodyPoints, cameras: tuple[Viewpoint, ...], sigma: np.ndarray, dynamics: Dynamics,
     preset: FitPreset, truth: Dynamics | None = None,
 ) -> Planner:  # fmt: skip
     """Return a planner with the costs of `terms_of`.

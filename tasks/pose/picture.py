@@ -31,23 +31,21 @@ FRAMES = 6
 KINEMATIC, PHYSICAL, DETECTED = "#9aa5b1", "#1f6fb2", "#d1495b"
 
 
-def pose_picture(
-    views: Views, cameras: Sequence[Camera], executed: np.ndarray, kinematic: np.ndarray, path: Path
-) -> None:
+def pose_picture(views: Views, executed: np.ndarray, kinematic: np.ndarray, path: Path) -> None:
     """Draw some frames of a film, in each image above and from the first camera's side below, and write them to a PNG.
 
     executed, kinematic: points (T, P, 3) [m] of the executed motion, and of the kinematic start.
     """
-    frames, films = np.linspace(0, len(views) - 1, FRAMES).astype(int), len(cameras)
-    drawing = Figure(figsize=(14.0, 0.4 + 2.9 * (films + 1)), layout="constrained")
-    axes = drawing.subplots(films + 1, FRAMES)
+    (films, cameras), frames = views.as_images(), np.linspace(0, len(views) - 1, FRAMES).astype(int)
+    drawing = Figure(figsize=(14.0, 0.4 + 2.9 * (len(films) + 1)), layout="constrained")
+    axes = drawing.subplots(len(films) + 1, FRAMES)
     for column, frame in enumerate(frames):
         axes[0, column].set_title(f"{frame / views.rate:.2f} s")
-    for film, camera, row in zip(views.films, cameras, axes[:-1], strict=True):
+    for film, camera, row in zip(films, cameras, axes[:-1], strict=True):
         _draw_images(row, film, frames, camera.project(executed), camera.project(kinematic))
     _draw_from_the_side(axes[-1], frames, cameras[0], executed, kinematic)
     for number, row in enumerate(axes[:-1], start=1):
-        row[0].set_ylabel("in the image" if films == 1 else f"image of film {number}")
+        row[0].set_ylabel("in the image" if len(films) == 1 else f"image of film {number}")
     axes[-1, 0].set_ylabel("from the camera's side, height [m]")
     names = ("keypoints", DETECTED), ("kinematic start", KINEMATIC), ("physical motion, MuJoCo", PHYSICAL)
     handles = [axes[0, 0].plot([], [], color=color, lw=2, label=name)[0] for name, color in names]

@@ -21,11 +21,12 @@ RATES = (5.0, 1000.0)
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Keypoints of one person in the images of a film.
+    """Keypoints of one person in the images of a film, or in space.
 
-    places: (T, P, 2) [px], in the order of `POINTS`, x to the right and y down from the upper left corner; NaN where a
-    point was not detected. confidence: (T, P) from 0, not detected, to 1. rate: frames per second. size: width and
-    height of the images [px], if they are known. Raises an InputError where these do not fit together.
+    places: (T, P, 2) [px], in the order of `POINTS`, x to the right and y down from the upper left corner, or (T, P, 3)
+    [m], z up, the ground at 0; NaN where a point was not detected. confidence: (T, P) from 0, not detected, to 1. rate:
+    frames per second. size: width and height of the images [px], if they are known. Raises an InputError where these do
+    not fit together.
     """
 
     places: np.ndarray
@@ -35,10 +36,14 @@ class Keypoints:
 
     def __post_init__(self) -> None:
         frames = len(self.places)
-        if self.places.shape != (frames, len(POINTS), 2) or self.confidence.shape != (frames, len(POINTS)):
+        if (
+            self.places.shape[:2] != (frames, len(POINTS))
+            or self.places.shape[2:] not in ((2,), (3,))
+            or self.confidence.shape != (frames, len(POINTS))
+        ):
             raise InputError(
                 f"places and confidence have shapes {self.places.shape} and {self.confidence.shape}, but need "
-                f"(T, {len(POINTS)}, 2) and (T, {len(POINTS)})"
+                f"(T, {len(POINTS)}, 2 or 3) and (T, {len(POINTS)})"
             )
         if not (RATES[0] <= self.rate <= RATES[1]):
             raise InputError(f"rate is {self.rate:g}, but must be from {RATES[0]:g} to {RATES[1]:g} frames a second")

@@ -15,7 +15,6 @@ import numpy as np
 from larp_model import state as packed
 from larp_model.bodies import human, standing_height
 from larp_model.engines.mujoco import SUBSTEPS, Truth
-from larp_model.errors import InputError
 from larp_model.scene import Body, Scene
 from larp_model.simulator import Simulator
 from mpc import Dynamics, MujocoDynamics
@@ -34,21 +33,6 @@ DT = 0.01
 OVERLAY_DISTANCE = 0.2
 # Time between saves of the progress [s].
 SAVE_INTERVAL = 5.0
-# Fewest frames that show a person.
-MIN_FRAMES = 10
-
-
-def frames_with_person(views: Views) -> tuple[int, int]:
-    """Return the first and the last frame in which a person is seen; raises InputError if too few show one."""
-    frames = views.frames_with_person
-    if len(frames) < MIN_FRAMES:
-        raise InputError(f"keypoints show 6 or more points in {len(frames)} frames, but need {MIN_FRAMES} such frames")
-    return int(frames[0]), int(frames[-1])
-
-
-def cut(views: Views) -> Views:
-    """Return the views from the first frame in which a person is seen to the last."""
-    return views.cut(*frames_with_person(views))
 
 
 def angles_of(states: np.ndarray, body: Body, dt: float) -> dict[str, Any]:
@@ -66,11 +50,12 @@ def angles_of(states: np.ndarray, body: Body, dt: float) -> dict[str, Any]:
 class Reconstruction(NamedTuple):
     """Reconstructed motion of a film, before physics and after.
 
-    lifted: see `lift.Lifted`. body: as it was simulated. start, executed: points (T, P, 3) [m] in every frame, of the
-    kinematic start and of the executed motion. filmed: the kinematic start at every step. states: (N, L, 13), executed.
-    effort: the cost of planning.
+    views: by cameras as estimated. lifted: see `lift.Lifted`. body: as it was simulated. start, executed: points
+    (T, P, 3) [m] in every frame, of the kinematic start and of the executed motion. filmed: the kinematic start at
+    every step. states: (N, L, 13), executed. effort: the cost of planning.
     """
 
+    views: Views
     lifted: lift.Lifted
     body: Body
     start: np.ndarray
@@ -99,7 +84,7 @@ def reconstruct(
     preset: the cost of a plan. progress: to continue from, and to save progress in. on_step: called after every
     step, with the number of steps done and of all.
     """
-    figure = figures.figure()
+    views, figure = views.corrected(lifted.corrections), figures.figure()
     body = figure.body_of(lifted.proportions)
     scene = Scene((body,), dt=DT)
     model: Dynamics
@@ -110,7 +95,7 @@ def reconstruct(
         model, truth = Simulator.of_physics(scene), MujocoDynamics(Truth(scene, 1, SUBSTEPS))
     filmed = physical.filmed_motion(scene, figure, lifted, views)
     body_points = physical.BodyPoints(body, figure, lifted.proportions)
-    planner = physical.planner_of(scene, body_points, lifted.cameras, views.sigma, model, preset, truth)
+    planner = physical.planner_of(scene, body_points, views.cameras, views.sigma, model, preset, truth)
     effort, plans_counted, save_time = PlanningEffort() if progress is None else progress.effort, 0, time.monotonic()
 
     def observe(execution: Execution) -> None:
@@ -129,12 +114,12 @@ def reconstruct(
     points_at_steps = np.asarray(body_points.points(states.astype(np.float32)), float)
     executed = interpolated(points_at_steps, 1.0 / scene.dt, views.times)
     start = figure.all_points(lifted.pose, lifted.proportions)
-    return Reconstruction(lifted, body, start, executed, filmed, states, effort)
+    return Reconstruction(views, lifted, body, start, executed, filmed, states, effort)
 
 
-def overlay_of(views: Views, result: Reconstruction) -> Overlay:
+def overlay_of(result: Reconstruction) -> Overlay:
     """Return the motion under the keypoints of the first film, for a page."""
-    film, camera = views.films[0], result.lifted.cameras[0]
+    (film, *_), (camera, *_) = result.views.as_images()
     position, turn = np.asarray(camera.position, float), np.asarray(camera.turn, float)
     depth = (result.executed - position) @ turn[2]
     places = np.where(film.detected[..., None], film.places, np.nan), camera.project(result.executed)

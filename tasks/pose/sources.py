@@ -1,4 +1,4 @@
-"""Views of a filmed person from files: keypoints of one film or several, and their cameras."""
+"""Views of a person from files: keypoints of one film or several and their cameras, or points in space."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from typing import NamedTuple
 import numpy as np
 
 from larp_model.errors import InputError
-from tasks.pose import calibration, formats
+from tasks.pose import calibration, formats, joint_files
 from tasks.pose import camera as cameras
 from tasks.pose.camera import Lens, LoadedCamera
 from tasks.pose.formats import LoadedPeople
 from tasks.pose.points import Keypoints, require_inside
-from tasks.pose.synchronisation import MIN_FRAMES, match, synchronised
-from tasks.pose.views import Views
+from tasks.pose.space import Space
+from tasks.pose.synchronisation import match, synchronised
+from tasks.pose.views import MIN_FRAMES, Views
 
 # Misfit of two films beyond which their cameras, or the people in them, are not what they are taken for.
 MAX_MISFIT = 0.15
@@ -51,12 +52,15 @@ def load(
 ) -> FilmedPerson:
     """Read a person's films; an InputError of one line names what is missing, or does not fit together.
 
-    keypoints: of each film, see `formats.load_people`. rates: frames per second, of each film or of all. size, points:
-    see there. person: in the first film, see `formats.load`. camera_files: of each film, or one that has all cameras;
-    see `calibration.fields_of`. turned: see `LoadedCamera.turned`.
+    keypoints: of each film, see `formats.load_people`, or one file of points in space, see `joint_files.load`. rates:
+    frames per second, of each film or of all. size, points: see there. person: in the first film, see `formats.load`.
+    camera_files: of each film, or one that has all cameras; see `calibration.fields_of`. turned: see
+    `LoadedCamera.turned`.
     """
     if not keypoints:
         raise InputError("keypoints is empty, but needs a file or a folder of a film")
+    if any(map(joint_files.is_joint_file, keypoints)):
+        return _in_space(keypoints, rates, camera_files)
     crowds = [
         formats.load_people(path, rate, size, points)
         for path, rate in zip(keypoints, _rates_of_films(rates, len(keypoints)), strict=True)
@@ -70,6 +74,16 @@ def load(
         views, further_notes = _together(views.films[0], crowds, lenses)
         notes += further_notes
     return FilmedPerson(views, lenses[0].position_known, first.people, first.crossed, tuple(notes))
+
+
+def _in_space(paths: Sequence[Path], rates: Sequence[float], camera_files: Sequence[Path]) -> FilmedPerson:
+    """Return a person whose points are known in space."""
+    if len(paths) > 1 or camera_files:
+        argument, found = ("cameras", "is set") if camera_files else ("keypoints", f"are {len(paths)} files")
+        raise InputError(f"{argument} {found}, but points in space are one file, and need no camera")
+    (rate,) = _rates_of_films(rates, 1)
+    joints = joint_files.load(paths[0], rate)
+    return FilmedPerson(Views((joints.keypoints,), (Space(),)), True, 1, 0, joints.notes)
 
 
 def _rates_of_films(rates: Sequence[float], films: int) -> Sequence[float | None]:

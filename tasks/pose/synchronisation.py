@@ -17,10 +17,10 @@ from larp_model.errors import InputError
 from tasks.pose.camera import Camera
 from tasks.pose.points import Keypoints
 from tasks.pose.triangulation import OUTLIER
-from tasks.pose.views import Views
+from tasks.pose.views import MIN_FRAMES, Views
 
-# Films have this share of the shorter one in common, and at least this many frames.
-COMMON_SHARE, MIN_FRAMES = 0.4, 10
+# Films have this share of the shorter one in common, and at least `MIN_FRAMES`.
+COMMON_SHARE = 0.4
 # Number of frames that are compared, of all that two films have in common.
 COMPARED_FRAMES = 120
 
@@ -117,7 +117,7 @@ def _misfit(views: Views) -> float:
 
 def _gaps(views: Views) -> np.ndarray:
     """Return the distances (T, P) between the rays of two films' points, in standard deviations of their places."""
-    cameras, places = views.cameras, np.nan_to_num(views.places)
+    (_, cameras), places = views.as_images(), np.nan_to_num(views.places)
     one, two = (camera.ray(places[:, view]) for view, camera in enumerate(cameras))
     between = cameras[1].position - cameras[0].position
     normal = np.cross(one, two)

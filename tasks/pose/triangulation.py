@@ -7,7 +7,8 @@ from itertools import combinations
 
 import numpy as np
 
-from tasks.pose.camera import Camera, places_in_all
+from tasks.pose.camera import Camera
+from tasks.pose.views import places_in_all
 
 # An image's place is an outlier where it is more standard deviations than this from the point's projection.
 OUTLIER = 6.0
