@@ -328,7 +328,7 @@ def test_what_is_missing_or_damaged_is_refused_in_one_line(name: str, kick: np.n
         ({"sequences": (OTHER,)}, "but no such file exists"),
         ({"aist": Path("empty")}, "aist is 'empty', but keypoints2d in it has no sequence that mapping.txt has"),
         ({"sequences": (SEQUENCE,)}, "sequences has 'gBR_sBM_c01_.*show 6 or more points in 0 frames"),
-        ({"cameras": 10}, "cameras is 10, but AIST.. has 9"),
+        ({"viewpoints": 10}, "viewpoints is 10, but AIST.. has 9"),
         ({"clips": (Path("kick.bvh"),)}, "clips and aist are both set"),
         ({"aist": None, "sequences": (SEQUENCE,)}, "sequences has .*but aist, the folder they are in, is not set"),
     ],

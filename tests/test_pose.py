@@ -185,7 +185,7 @@ def test_what_cannot_be_reconstructed_is_refused_in_one_line_and_nothing_is_writ
 
 def test_the_benchmark_tells_how_far_a_reconstruction_is_from_what_was_filmed(tmp_path: Path) -> None:
     path = tmp_path / "pose.json"
-    benchmark.main(cameras=1, seconds=0.6, ways=("kinematic",), seed=3, json=path)
+    benchmark.main(viewpoints=1, seconds=0.6, ways=("kinematic",), seed=3, json=path)
     found = json.loads(path.read_text())
     (row,) = found["rows"]
     assert (
@@ -218,11 +218,14 @@ def test_a_slow_model_is_given_as_many_candidates_as_it_has_time_for(share: floa
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ({"cameras": 0}, "cameras is 0"),
+        ({"viewpoints": 0}, "viewpoints is 0"),
         ({"seconds": 0.1}, "seconds is 0.1, but must be from 0.4 to 60"),
         ({"ways": ("larp", "larp")}, "each once"),
         ({"ways": ("larp", "mujoco_timed", "mujoco")}, "mujoco_timed, but needs larp and mujoco before it"),
         ({"clips": (Path("nowhere.bvh"),)}, "clips is 'nowhere.bvh', but no such file exists"),
+        ({"together": 0}, "together is 0, but must be at least 1"),
+        ({"film": (Path("film.npz"),)}, "film and truth belong together, but only one of them is set"),
+        ({"clips": (Path("a.bvh"),), "film": (Path("b.npz"),)}, "clips and film are both set, but films are of one of"),
     ],
 )
 def test_a_benchmark_that_makes_no_sense_is_refused(arguments: dict[str, Any], said: str, tmp_path: Path) -> None:
@@ -233,3 +236,19 @@ def test_a_benchmark_that_makes_no_sense_is_refused(arguments: dict[str, Any], s
 def test_too_few_frames_are_refused(film: dict[str, Any]) -> None:
     with pytest.raises(InputError, match="6 or more points in 5 frames, but need 10"):
         Views((film["keypoints"].cut(0, 4),), (film["lens"],)).with_person()
+
+
+def test_own_films_are_judged_by_one_camera_by_two_and_by_all(film: dict[str, Any], tmp_path: Path) -> None:
+    films = tuple(written(tmp_path, film[name], name) for name in ("keypoints", "second keypoints"))
+    cameras = tuple(camera_file(tmp_path / f"{name}.json", film[name]) for name in ("lens", "second"))
+    truth = tmp_path / "truth.npz"
+    quarter = film["true"] @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    np.savez(truth, names=np.array(POINTS), positions=quarter, rate=50.0)
+    path = tmp_path / "pose.json"
+    benchmark.main(film=films, cameras=cameras, truth=truth, ways=("kinematic",), json=path)
+    one, other, both = json.loads(path.read_text())["rows"]
+    assert [row["clip"] for row in (one, other, both)] == ["1 camera", "1 camera", "2 cameras"]
+    assert both["kinematic"]["mpjpe_g_mm"] < min(row["kinematic"]["mpjpe_g_mm"] for row in (one, other)) < 120.0
+    np.savez(truth, names=np.array(POINTS), positions=quarter + np.array([1.0, 0.0, 0.0]), rate=50.0)
+    with pytest.raises(InputError, match=r"truth is \d+ px off the first film in half of its points"):
+        benchmark.main(film=films, cameras=cameras, truth=truth, ways=("kinematic",), json=path)

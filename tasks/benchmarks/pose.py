@@ -1,4 +1,4 @@
-"""Errors of motion from keypoints against the filmed motion: clips seen by synthetic cameras, or AIST++."""
+"""Errors of motion from keypoints: of clips filmed by synthetic cameras, of AIST++, or of one's own films."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
+from scipy.spatial.transform import Rotation
 
 from larp_model.bodies import human_and_ball
 from larp_model.errors import InputError
@@ -24,13 +26,16 @@ from tasks.motions import skeleton
 from tasks.motions.references import embedded, motion_of
 from tasks.pose import aist as dances
 from tasks.pose import figure as figures
-from tasks.pose import lift, metrics, physical, synthetic_film
+from tasks.pose import joint_files, lift, metrics, physical, sources, synthetic_film
 from tasks.pose.figure import SHARED
-from tasks.pose.points import interpolated
+from tasks.pose.points import Keypoints, interpolated
 from tasks.pose.reconstruction import reconstruct
+from tasks.pose.synchronisation import resampled
 from tasks.pose.views import Views, places_in_all
 from tasks.presets import PresetName
 
+# Half of the points of a film may be this far from its truth, in standard deviations of its keypoints.
+MAX_MISFIT = 6.0
 # Frame rate of a synthetic film [1/s], and the share of it before a kick's strike.
 RATE, BEFORE = 60.0, 0.63
 Way = Literal["kinematic", "larp", "mujoco", "mujoco_timed"]
@@ -75,7 +80,12 @@ class FilmSettings:
     clips: tuple[Path, ...]
     aist: Path | None
     sequences: tuple[str, ...]
-    cameras: int
+    film: tuple[Path, ...]
+    cameras: tuple[Path, ...]
+    rate: tuple[float, ...]
+    truth: Path | None
+    viewpoints: int
+    together: int
     seconds: float
     ways: tuple[Way, ...]
     preset: PresetName
@@ -83,17 +93,20 @@ class FilmSettings:
 
     def check(self) -> None:
         """Raise InputError if a setting is invalid, or two of them contradict each other."""
-        self._check_cameras()
+        self._check_viewpoints()
         if not 0.4 <= self.seconds <= 60.0:
             raise InputError(f"seconds is {self.seconds:g}, but must be from 0.4 to 60")
         self._check_ways()
         self._check_sources()
 
-    def _check_cameras(self) -> None:
-        if self.cameras < 1:
-            raise InputError(f"cameras is {self.cameras}, but must be at least 1")
-        if self.aist is not None and self.cameras > dances.CAMERAS:
-            raise InputError(f"cameras is {self.cameras}, but AIST++ has {dances.CAMERAS}")
+    def _check_viewpoints(self) -> None:
+        for name, count in (("viewpoints", self.viewpoints), ("together", self.together)):
+            if count < 1:
+                raise InputError(f"{name} is {count}, but must be at least 1")
+        if self.aist is not None and self.viewpoints > dances.CAMERAS:
+            raise InputError(f"viewpoints is {self.viewpoints}, but AIST++ has {dances.CAMERAS}")
+        if self.together > 1 and (self.aist is not None or self.film):
+            raise InputError("together is set, but is of clips' synthetic cameras: aist and film have their own")
 
     def _check_ways(self) -> None:
         ways = self.ways
@@ -103,8 +116,12 @@ class FilmSettings:
             raise InputError("ways has mujoco_timed, but needs larp and mujoco before it, whose times it goes by")
 
     def _check_sources(self) -> None:
-        if self.clips and self.aist is not None:
-            raise InputError("clips and aist are both set, but films are made of one of them")
+        sources = {"clips": bool(self.clips), "aist": self.aist is not None, "film": bool(self.film)}
+        if sum(sources.values()) > 1:
+            both = " and ".join(name for name, is_set in sources.items() if is_set)
+            raise InputError(f"{both} are both set, but films are of one of them")
+        if bool(self.film) != (self.truth is not None):
+            raise InputError("film and truth belong together, but only one of them is set")
         if self.sequences and self.aist is None:
             raise InputError(f"sequences has {self.sequences[0]!r}, but aist, the folder they are in, is not set")
         for clip in self.clips:
@@ -117,9 +134,17 @@ class FilmSettings:
         if self.aist is not None:
             source = f" --aist {self.aist.name}"
             source += f" --sequences {' '.join(self.sequences)}" if self.sequences else ""
+        if self.truth is not None:
+            names = {"film": self.film, "cameras": self.cameras, "truth": (self.truth,)}
+            source = "".join(
+                f" --{name} {' '.join(path.name for path in paths)}" for name, paths in names.items() if paths
+            )
         options = "" if self.ways == WAYS else f" --ways {' '.join(self.ways)}"
         options += "" if self.preset == "balanced" else f" --preset {self.preset}"
-        films = f"{source} --cameras {self.cameras} --seconds {self.seconds:g}"
+        together = "" if self.together == 1 else f" --together {self.together}"
+        films = f"{source} --viewpoints {self.viewpoints}{together} --seconds {self.seconds:g}"
+        if self.film:
+            films = source
         return f"python -m tasks.benchmarks.pose{films}{options} --seed {self.seed}"
 
 
@@ -156,13 +181,59 @@ def filmed_points(clip: Path | None, seconds: float) -> np.ndarray:
     return points[first : first + count]
 
 
-def film_of_clip(clip: Path | None, camera: int, seconds: float, seed: int) -> Film:
-    """Return a film of some seconds of a clip, seen by a synthetic camera and detector."""
+def film_of_clip(clip: Path | None, viewpoint: int, together: int, seconds: float, seed: int) -> Film:
+    """Return films of some seconds of a clip, seen by so many synthetic cameras and detectors together."""
     true = filmed_points(clip, seconds)
-    random = np.random.default_rng((seed, camera))
-    lens = synthetic_film.camera_around(random, true)
-    name = "embedded" if clip is None else clip.stem
-    return Film(name, Views((synthetic_film.detected(random, lens, true, RATE),), (lens,)), true)
+    random = np.random.default_rng((seed, viewpoint))
+    lenses = tuple(synthetic_film.camera_around(random, true) for _ in range(together))
+    films = tuple(synthetic_film.detected(random, lens, true, RATE) for lens in lenses)
+    return Film("embedded" if clip is None else clip.stem, Views(films, lenses), true)
+
+
+def films_with_truth(settings: FilmSettings) -> dict[str, Callable[[], Film]]:
+    """Return loaders of one's own films, by name: of each camera alone, of each two, and of all together."""
+    assert settings.truth is not None
+    person = sources.load(settings.film, settings.rate, camera_files=settings.cameras)
+    if not person.position_known:
+        raise InputError("cameras have no positions, but the truth is in the world that they are in")
+    views = person.views.with_person()
+    begin = int(person.views.frames_with_person[0])
+    joints = joint_files.load(settings.truth, grounded=False).keypoints
+    true = true_points(person.views, joints)[begin:][: len(views)]
+    numbers = range(len(views.films))
+    subsets = [subset for count in sorted({1, 2, len(numbers)}) for subset in combinations(numbers, count)]
+    names = [path.stem for path in settings.film]
+    return {
+        "+".join(names[number] for number in subset): partial(
+            Film,
+            f"{len(subset)} camera{'s' if len(subset) > 1 else ''}",
+            Views(tuple(views.films[number] for number in subset), tuple(views.cameras[number] for number in subset)),
+            true,
+        )
+        for subset in subsets
+    }
+
+
+def true_points(views: Views, joints: Keypoints) -> np.ndarray:
+    """Return true joints, at the times of the films' frames and turned about z as they see them.
+
+    joints: in space, from the first film's first frame on. Their axes may be exchanged, as z is not up in every file.
+    """
+    at_frames = resampled(joints, views.times, views.rate).places
+    places, sigma = views.places, views.sigma[:, None]
+
+    def misfit(points: np.ndarray) -> float:
+        distances = np.linalg.norm(places_in_all(views.cameras, points) - places, axis=-1) / sigma
+        return float(np.nanmedian(distances)) if np.isfinite(distances).any() else np.inf
+
+    turns = Rotation.from_euler("z", 90.0 * np.arange(4)[:, None], degrees=True).as_matrix()
+    best: np.ndarray = min((at_frames @ turn for turn in turns), key=misfit)
+    if misfit(best) > MAX_MISFIT:
+        raise InputError(
+            f"truth is {misfit(best) * float(sigma[0, 0]):.0f} px off the first film in half of its points: its world, "
+            "or its first frame, is another one"
+        )
+    return best
 
 
 def film_of_dance(folder: Path, sequence: str, camera: int, seconds: float) -> Film:
@@ -268,7 +339,12 @@ def main(
     clips: tuple[Path, ...] = (),
     aist: Path | None = None,
     sequences: tuple[str, ...] = (),
-    cameras: int = 2,
+    film: tuple[Path, ...] = (),
+    cameras: tuple[Path, ...] = (),
+    rate: tuple[float, ...] = (),
+    truth: Path | None = None,
+    viewpoints: int = 2,
+    together: int = 1,
     seconds: float = 2.5,
     ways: tuple[Way, ...] = WAYS,
     preset: PresetName = "balanced",
@@ -283,7 +359,13 @@ def main(
         aist: folder of AIST++'s annotations, whose dances are taken instead; the paper's figures are put beside.
         sequences: of aist, by its names (gBR_sBM_cAll_d06_mBR4_ch06) or those of videos (gBR_sBM_c06_d06_mBR4_ch06,
             camera 6 alone); 15 videos that others take by default, as far as the folder has them, else all that it has.
-        cameras: that see each of them, somewhere around it; of aist, the first.
+        film: keypoints of one's own films of a person, as tasks.pose takes them; each camera is judged alone, each two,
+            and all together.
+        cameras: of film, as tasks.pose takes them.
+        rate: of film, frames a second, as tasks.pose takes it.
+        truth: joints in space (TRC, C3D or npz) of film, in the cameras' world, from its first frame on.
+        viewpoints: from which each clip is filmed, somewhere around it; of aist, its first cameras.
+        together: cameras that film a clip at once from each viewpoint.
         seconds: of each film, of 60 frames each; of aist, the first.
         ways: the kinematic start alone, or followed by a planner whose model is larp or mujoco, with as many candidates
             each; mujoco_timed has so few that it takes about larp's time, and comes after both.
@@ -292,7 +374,9 @@ def main(
         json: where the figures go; the picture goes beside them.
         publish: put the table into RESULTS.md.
     """
-    settings = FilmSettings(clips, aist, sequences, cameras, seconds, ways, preset, seed)
+    settings = FilmSettings(
+        clips, aist, sequences, film, cameras, rate, truth, viewpoints, together, seconds, ways, preset, seed
+    )
     settings.check()
     films = films_of(settings)
     report.ready(json, publish)
@@ -303,26 +387,38 @@ def main(
     content = {"command": settings.command, "hardware": report.hardware(), "means": averages, "rows": rows}
     report.write_json(json, content)
     report.write_picture(json.with_suffix(".png"), picture(rows, ways))
-    title = f"Motion from keypoints, {preset}, {len(rows)} film{'' if len(rows) == 1 else 's'}"
-    if aist is not None:
+    for count in sorted({len(row["cameras_m"]) for row in rows}):
+        show(settings, [row for row in rows if len(row["cameras_m"]) == count], count, publish)
+
+
+def show(settings: FilmSettings, rows: list[dict[str, Any]], cameras: int, publish: bool) -> None:
+    """Show the table of films by so many cameras at once, and put it into RESULTS.md if asked to."""
+    title = f"Motion from keypoints, {settings.preset}, {len(rows)} motion{'' if len(rows) == 1 else 's'}"
+    title += f" by {cameras} camera{'' if cameras == 1 else 's at once'}"
+    if settings.aist is not None:
         title += " of AIST++, beside the paper's figures, of videos that it does not name"
-    table = table_of(rows, averages, title, {} if aist is None else PAPER)
+    averages = {way: means(rows, way) for way in settings.ways}
+    table = table_of(rows, averages, title, {} if settings.aist is None else PAPER)
     report.show(table)
     if publish:
-        section = ["pose", *(["aist"] if aist else []), *([] if preset == "balanced" else [preset])]
-        report.publish("-".join(section), title, settings.command, table)
+        source = ["aist"] if settings.aist else ["film"] if settings.film else []
+        number = [] if cameras == 1 else [f"{cameras}-cameras"]
+        preset = [] if settings.preset == "balanced" else [settings.preset]
+        report.publish("-".join(["pose", *source, *number, *preset]), title, settings.command, table)
 
 
 def films_of(settings: FilmSettings) -> dict[str, Callable[[], Film]]:
     """Return loaders of films, by name: of AIST++, or of clips seen by synthetic cameras."""
     if settings.aist is not None:
-        return dances_of(settings.aist, settings.sequences, settings.cameras, settings.seconds)
+        return dances_of(settings.aist, settings.sequences, settings.viewpoints, settings.seconds)
+    if settings.film:
+        return films_with_truth(settings)
     return {
-        f"{'embedded' if clip is None else clip.stem}, camera {camera}": partial(
-            film_of_clip, clip, camera, settings.seconds, settings.seed
+        f"{'embedded' if clip is None else clip.stem}, viewpoint {viewpoint}": partial(
+            film_of_clip, clip, viewpoint, settings.together, settings.seconds, settings.seed
         )
         for clip in (settings.clips or (None,))
-        for camera in range(settings.cameras)
+        for viewpoint in range(settings.viewpoints)
     }
 
 

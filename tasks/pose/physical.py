@@ -64,11 +64,12 @@ class FitPreset(NamedTuple):
         return self.steps, Verified(truth, replace(self.steps, rounds=1), self.verify, candidates=1)
 
 
-# With a horizon of only half a second, a plan notices too late that a start leans too far, and the human falls.
+# With a horizon of only half a second, a plan notices too late that a start leans too far, and the human falls. A plan
+# has so many unknowns that more directions bring it nearer than more rounds.
 PRESETS: dict[PresetName, FitPreset] = {
     "fast": FitPreset(80, 11, GaussNewton(rounds=2, directions=48)),
-    "balanced": FitPreset(80, 17, GaussNewton(rounds=4, directions=64)),
-    "accurate": FitPreset(80, 17, GaussNewton(rounds=2, directions=64), verify=6),
+    "balanced": FitPreset(80, 17, GaussNewton(rounds=4, directions=192)),
+    "accurate": FitPreset(80, 17, GaussNewton(rounds=2, directions=192), verify=6),
 }
 
 

@@ -15,7 +15,7 @@ from tasks.pose.figure import Figure, figure
 # Standard deviations of angles beyond a joint's limits [rad], and of a trunk's lean [rad].
 LIMIT_STD, LEAN_STD = 0.05, 0.6
 # Standard deviation [rad] that is added to that of the project's own motions, as people's poses differ more.
-EXTRA_STD = 0.05
+EXTRA_STD = 0.15
 # Number of initial poses, unlike each other, from which frames are solved alone.
 INITIAL_POSES = 4
 
