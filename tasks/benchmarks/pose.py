@@ -31,7 +31,7 @@ from tasks.pose.figure import SHARED
 from tasks.pose.points import Keypoints, interpolated
 from tasks.pose.reconstruction import reconstruct
 from tasks.pose.synchronisation import resampled
-from tasks.pose.views import Views, places_in_all
+from tasks.pose.views import Viewpoint, Views, places_in_all
 from tasks.presets import PresetName
 
 # Half of the points of a film may be this far from its truth, in standard deviations of its keypoints.
@@ -196,22 +196,21 @@ def films_with_truth(settings: FilmSettings) -> dict[str, Callable[[], Film]]:
     person = sources.load(settings.film, settings.rate, camera_files=settings.cameras)
     if not person.position_known:
         raise InputError("cameras have no positions, but the truth is in the world that they are in")
-    views = person.views.with_person()
-    begin = int(person.views.frames_with_person[0])
-    joints = joint_files.load(settings.truth, grounded=False).keypoints
-    true = true_points(person.views, joints)[begin:][: len(views)]
-    numbers = range(len(views.films))
-    subsets = [subset for count in sorted({1, 2, len(numbers)}) for subset in combinations(numbers, count)]
-    names = [path.stem for path in settings.film]
+    true = true_points(person.views, joint_files.load(settings.truth, grounded=False).keypoints)
+    films = [*zip(settings.film, person.views.films, person.views.cameras, strict=True)]
+    subsets = [subset for count in sorted({1, 2, len(films)}) for subset in combinations(films, count)]
     return {
-        "+".join(names[number] for number in subset): partial(
-            Film,
-            f"{len(subset)} camera{'s' if len(subset) > 1 else ''}",
-            Views(tuple(views.films[number] for number in subset), tuple(views.cameras[number] for number in subset)),
-            true,
-        )
+        "+".join(path.stem for path, *_ in subset): partial(film_of_subset, [part[1:] for part in subset], true)
         for subset in subsets
     }
+
+
+def film_of_subset(subset: Sequence[tuple[Keypoints, Viewpoint]], true: np.ndarray) -> Film:
+    """Return a film of some of several cameras, as far as they show the person; true: points (T, P, 3) [m]."""
+    views = Views(tuple(film for film, _ in subset), tuple(camera for _, camera in subset))
+    shown = views.with_person()
+    name = f"{len(subset)} camera{'s' if len(subset) > 1 else ''}"
+    return Film(name, shown, true[views.frames_with_person[0] :][: len(shown)])
 
 
 def true_points(views: Views, joints: Keypoints) -> np.ndarray:
