@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -78,6 +79,21 @@ def test_whatever_is_dragged_stays_within_what_is_offered(
     handles._set_value(name, np.array(place))
     value = np.array(getattr(page.settings, name))
     assert (value >= np.array(box[0]) - 1e-12).all() and (value <= np.array(box[1]) + 1e-12).all()
+
+
+def test_a_ball_can_be_dragged_while_a_plan_is_shown(page: LivePage) -> None:
+    handles = page._handles
+    assert isinstance(handles, Handles)
+
+    def drag(number: int) -> None:
+        handles._set_value("roll", handles.ball_position + np.array([0.3 + 0.001 * number, 0.0, 0.0]))
+
+    def show(number: int) -> None:
+        handles.show_all(number % 2 == 0)
+
+    with ThreadPoolExecutor(4) as pool:
+        jobs = [pool.submit(action, number) for number in range(300) for action in (drag, show)]
+        assert [job.exception() for job in jobs] == [None] * len(jobs)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1.0, 1e9, "much", None])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -38,6 +39,7 @@ class Handles:
         self.target: tuple[float, ...] = tuple(map(float, target))
         self.spot: tuple[float, ...] = (0.0, 0.0)
         self.roll: tuple[float, ...] = (0.0, 0.0)
+        self._drawing = threading.Lock()
         flat_style: dict[str, Any] = {"disable_rotations": True, "active_axes": (True, True, False)}
         self._target = self._handle("target", {"disable_rotations": True, "disable_sliders": True}, SIZE)
         self._spot = self._handle("spot", {"disable_sliders": True, **flat_style}, 0.7 * SIZE)
@@ -84,15 +86,16 @@ class Handles:
             self._roll.position = ball_position + ARROW_TIME * np.array((*self.roll, 0.0)) + ROLL_HANDLE_OFFSET
         self._draw_arrow()
 
-    def _draw_arrow(self) -> None:
-        """Draw the rolling velocity of the ball as an arrow, or none below 0.1 m/s."""
+    def _draw_arrow(self, visible: bool = True) -> None:
+        """Draw the rolling velocity of the ball as an arrow, or none below 0.1 m/s or where it is not visible."""
         begin = self.ball_position
         end = begin + ARROW_TIME * np.array((*self.roll, 0.0))
-        if np.linalg.norm(self.roll) < 0.1:
-            self._server.scene.remove_by_name("/handles/rolling")
-        else:
-            points = np.array([[begin, end]], np.float32)
-            self._server.scene.add_arrows("/handles/rolling", points, ROLLING)
+        with self._drawing:  # a client drags while a plan is shown, and the server cannot replace a node twice at once
+            if not visible or np.linalg.norm(self.roll) < 0.1:
+                self._server.scene.remove_by_name("/handles/rolling")
+            else:
+                points = np.array([[begin, end]], np.float32)
+                self._server.scene.add_arrows("/handles/rolling", points, ROLLING)
 
     def _draw_marks(self) -> None:
         """Draw what moves with the handles of the ball: a ring around its spot and, for its roll, the head of a pin."""
@@ -133,7 +136,4 @@ class Handles:
         """Show all handles, or only that of the target."""
         for handle in (self._spot, self._roll):
             handle.visible = visible
-        if visible:
-            self._draw_arrow()
-        else:
-            self._server.scene.remove_by_name("/handles/rolling")
+        self._draw_arrow(visible)
