@@ -181,6 +181,11 @@ class TestMetrics:
         points[:, :, 1] += 0.4 * time[:, None]
         assert metrics.slip(points, 30.0) == pytest.approx(0.4, abs=0.1)
 
+    def test_slip_is_the_same_in_films_that_are_shorter_than_a_stride(self) -> None:
+        points = np.zeros((20, len(POINTS), 3))
+        points[:, :, 0] = 0.4 * np.arange(20)[:, None] / 1000.0
+        assert metrics.slip(points, 1000.0) == pytest.approx(0.4)
+
     def test_depth_in_the_ground_is_told(self) -> None:
         points = np.ones((4, len(POINTS), 3))
         points[0, metrics.FEET["left"], 2] = -0.04

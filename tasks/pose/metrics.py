@@ -94,7 +94,7 @@ def slip(points: np.ndarray, rate: float) -> float:
     moves.
     """
     feet = points[:, [row for rows in FEET.values() for row in rows]]
-    frames = max(1, round(STRIDE * rate))
+    frames = min(max(1, round(STRIDE * rate)), len(points) - 1)  # films may be shorter than a stride
     slowest = np.linalg.norm(feet[frames:] - feet[:-frames], axis=-1).min(axis=1) * rate / frames
     return float(np.percentile(slowest, 75.0))
 
