@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import keypoint_files
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from larp_model.bodies import human_and_ball
 from larp_model.errors import InputError
+from larp_model.files import arrays_of
 from tasks.motions.references import embedded
 from tasks.pose import camera as cameras
 from tasks.pose import figure as figures
@@ -72,6 +74,13 @@ def calibration(folder: Path, **by_name: Camera) -> Path:
         content += f"rotation = {rotation.tolist()}\ntranslation = {translation.tolist()}\nfisheye = false\n\n"
     (folder / "calib.toml").write_text(content.replace("distortions = [0.0, 0.0]\n", ""))
     return folder / "calib.toml"
+
+
+def person(points: np.ndarray) -> dict[str, Any]:
+    """One of AlphaPose's results, in COCO's order, of points (P, 3) in ours."""
+    rows = keypoint_files.rows(points, keypoint_files.COCO, 17)
+    rows[rows[:, 0] < 0.0] = 0.0
+    return {"category_id": 1, "keypoints": rows.ravel().tolist(), "score": 2.5}
 
 
 class TestTriangulation:
@@ -188,6 +197,24 @@ class TestFiles:
         paths = [films["paths"][0], written(films["folder"], "right_side", short.cut(0, 39))]
         notes = sources.load(paths, camera_files=(films["cameras"],)).notes
         assert any("right_side.npz: shows the person in" in note and "% of the first film's" in note for note in notes)
+
+    def test_how_near_the_cameras_see_the_same_points_is_said(self, films: dict[str, Any]) -> None:
+        notes = sources.load(films["paths"], camera_files=(films["cameras"],)).notes
+        distances = [float(note.split("within ")[1].split(" px")[0]) for note in notes if "cameras together" in note]
+        assert len(distances) == 2 and all(0.5 < distance < 5.0 for distance in distances)
+
+    def test_somebody_at_the_edge_of_another_film_does_not_end_the_search(self, films: dict[str, Any]) -> None:
+        film, frames = arrays_of(films["folder"] / "right_side.npz"), []
+        for places, confidence in zip(film["places"], film["confidence"], strict=True):
+            whole = np.column_stack([np.nan_to_num(places), confidence])
+            edge = np.where(np.arange(len(POINTS))[:, None] < 3, (40.0, 60.0, 0.9), 0.0)
+            frames.append([person(whole), person(edge)])
+        path = films["folder"] / "right_side.json"
+        path.write_text(
+            json.dumps([one | {"image_id": f"{row}.jpg"} for row, pair in enumerate(frames) for one in pair])
+        )
+        loaded = sources.load([films["paths"][0], path], (50.0,), SIZE, camera_files=(films["cameras"],))
+        assert any(note.startswith("right_side.json: person 0") for note in loaded.notes)
 
     def test_exchanged_cameras_are_refused_by_how_far_points_are_off(self, films: dict[str, Any]) -> None:
         files = [Path(f"{films['cameras']}:{name}") for name in ("right", "left")]

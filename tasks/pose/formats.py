@@ -26,7 +26,7 @@ from tasks.pose.detectors import (
 )
 from tasks.pose.people import Detection, Track, is_crossed, prominence, tracks_of
 from tasks.pose.point_orders import ORDERS, in_our_order, order_of
-from tasks.pose.points import POINTS, RATES, Keypoints, require_inside
+from tasks.pose.points import POINTS, Keypoints, require_inside, require_rate
 
 _MIN_POINTS = 6
 _NOBODY = "has no person in any frame"
@@ -134,12 +134,8 @@ def load_people(
         frames, notes = _understood(_in_order(film.frames), film, size or film.size, points)
     except InputError as error:
         raise InputError(f"{name} {error}") from None
-    rate = film.rate if rate is None else rate
-    if rate is None:
-        raise InputError(f"rate is not known, {name} does not hold it: give frames a second")
-    if not RATES[0] <= rate <= RATES[1]:
-        raise InputError(f"rate is {rate:g}, but must be from {RATES[0]:g} to {RATES[1]:g} frames a second")
-    return LoadedPeople(name, tracks_of(frames, rate), frames, float(rate), size or film.size, notes)
+    rate = require_rate(film.rate if rate is None else rate, name)
+    return LoadedPeople(name, tracks_of(frames, rate), frames, rate, size or film.size, notes)
 
 
 def _read(path: Path) -> DetectedFilm:

@@ -20,7 +20,7 @@ from larp_model.errors import InputError
 from larp_model.files import arrays_of
 from larp_model.names import require_file, require_known
 from tasks.pose.figure import SOLE_HEIGHT
-from tasks.pose.points import FEET, POINTS, RATES, SIDES, Keypoints
+from tasks.pose.points import FEET, POINTS, SIDES, Keypoints, require_rate
 
 SUFFIXES = (".trc", ".c3d")
 # Words for our points, without their side; of several that a file has, the first one here is taken. A word for a link
@@ -103,17 +103,13 @@ def load(
             places, ground = _on_ground(places) if grounded else (places, "")
     except InputError as error:
         raise InputError(f"{name} {error}") from None
-    rate = recording.rate if rate is None else rate
-    if rate is None:
-        raise InputError(f"rate is not known, {name} does not hold it: give frames a second")
-    if not RATES[0] <= rate <= RATES[1]:
-        raise InputError(f"rate is {rate:g}, but must be from {RATES[0]:g} to {RATES[1]:g} frames a second")
+    rate = require_rate(recording.rate if rate is None else rate, name)
     known = np.isfinite(places[..., 0]).astype(float)
     notes = (
         f"{len(rows)} points: {', '.join(labels[row] for row in rows.values())}",
         f"{up} up, in {unit}{ground}",
     )
-    return Joints(Keypoints(places, known, float(rate)), notes)
+    return Joints(Keypoints(places, known, rate), notes)
 
 
 def _rows(labels: list[str], names: Mapping[str, str]) -> dict[int, int]:

@@ -36,7 +36,7 @@ from tasks.pose.per_frame import PerFrameFit
 from tasks.pose.points import FEET, POINTS, SIDES
 from tasks.pose.prior import prior_residuals
 from tasks.pose.rows import by_rows, single
-from tasks.pose.views import Viewpoint, Views, places_in_all
+from tasks.pose.views import OUTLIER, Viewpoint, Views, places_in_all
 
 # Standard deviation of the body's size, as a share.
 SIZE_STD = 0.06
@@ -50,8 +50,6 @@ ACCELERATIONS = {"elbow": 40.0, "wrist": 40.0, "knee": 50.0, "ankle": 50.0, "hee
 # Scales of a standing foot's speed [m/s], of its height and of its depth in the ground [m]; speed [m/s] and height [m]
 # at which a foot may stand.
 FOOT_SPEED, FOOT_HEIGHT, FOOT_DEPTH, STANDING_SPEED, STANDING_HEIGHT = 0.10, 0.015, 0.005, 0.8, 0.08
-# Residuals beyond this number of standard deviations are weighted down.
-OUTLIER = 6.0
 STEPS = 40
 # Standard deviation of the body's height, as a share, where the height is known or the camera is not. In the latter
 # case no image shows the scale and a small body accelerates least, so people are taken to be as tall as usual.

@@ -64,7 +64,7 @@ class PerFrameFit:
 
         The distance from the camera follows from the size of the person in the image that shows most points.
         """
-        views = self.views.corrected(shared[SHARED : SHARED + 3])
+        views, confidence = self.views.corrected(shared[SHARED : SHARED + 3]), self.views.confidence
         headings = np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False)
         turns = np.repeat(Rotation.from_rotvec(headings[:, None] * (0.0, 0.0, 1.0)).as_matrix(), INITIAL_POSES, axis=0)
         angles = np.tile(self.usual_angles, (HEADINGS, 1, 1))
@@ -72,7 +72,7 @@ class PerFrameFit:
         points_at_origin = self.figure.all_points(pose, shared[:SHARED])
         guesses = np.zeros((len(frames), len(turns), 6 + 3 * self.figure.joints))
         for row, frame in enumerate(frames):
-            view = int(views.confidence[frame].sum(axis=-1).argmax())
+            view = int(confidence[frame].sum(axis=-1).argmax())
             is_detected, camera = views.films[view].detected[frame], views.cameras[view]
             guesses[row, :, :3] = camera.placed(
                 views.films[view].places[frame, is_detected], points_at_origin[:, is_detected]

@@ -34,9 +34,9 @@ from tasks.exploration import exploration_std
 from tasks.motions.references import clearance, with_angular_velocities, with_servo_lead
 from tasks.motions.skeleton import sampled_times
 from tasks.pose.figure import Figure, Pose
-from tasks.pose.lift import OUTLIER, STANDING_SPEED, Lifted
+from tasks.pose.lift import STANDING_SPEED, Lifted
 from tasks.pose.points import FEET, POINTS, interpolated
-from tasks.pose.views import Viewpoint, Views, places_in_all
+from tasks.pose.views import OUTLIER, Viewpoint, Views, places_in_all
 from tasks.presets import PresetName
 
 # Spread of a first plan, as a share of the training data's spread around its motions.

@@ -71,6 +71,15 @@ class Keypoints:
         return replace(self, places=self.places[frames], confidence=self.confidence[frames])
 
 
+def require_rate(rate: float | None, name: str) -> float:
+    """Return the frames per second of a file, of this name; raises InputError where they are not known, or unusual."""
+    if rate is None:
+        raise InputError(f"rate is not known, {name} does not hold it: give frames a second")
+    if not RATES[0] <= rate <= RATES[1]:
+        raise InputError(f"rate is {rate:g}, but must be from {RATES[0]:g} to {RATES[1]:g} frames a second")
+    return float(rate)
+
+
 def require_inside(film: Keypoints, size: Sequence[float] | np.ndarray, name: str) -> None:
     """Raise InputError where most of the detected points lie outside images of this size [px]."""
     places = film.places[film.detected]

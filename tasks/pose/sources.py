@@ -17,6 +17,7 @@ from tasks.pose.formats import LoadedPeople
 from tasks.pose.points import Keypoints, require_inside
 from tasks.pose.space import Space
 from tasks.pose.synchronisation import match, synchronised
+from tasks.pose.triangulation import triangulated
 from tasks.pose.views import MIN_FRAMES, Views
 
 # Misfit of two films beyond which their cameras, or the people in them, are not what they are taken for.
@@ -174,6 +175,12 @@ def _together(
         when = "later" if found.delay > 0.0 else "earlier"
         notes.append(f"{crowd.name}: person {person}, began {abs(found.delay):.3f} s {when}")
     views = synchronised(films, [loaded.camera for loaded in lenses], delays)
+    _, distances = triangulated([loaded.camera for loaded in lenses], views.places, views.confidence, views.sigma)
+    notes += [
+        f"{crowd.name}: half of its points are within {np.median(known):.1f} px of where the cameras together see them"
+        for crowd, of_film in zip(crowds, np.moveaxis(distances, 1, 0), strict=True)
+        if (known := of_film[np.isfinite(of_film)]).size
+    ]
     shown = ((views.confidence > 0.0).sum(axis=-1) >= 6).mean(axis=0)
     notes += [
         f"{crowd.name}: shows the person in {100.0 * share:.0f} % of the first film's frames"
@@ -186,6 +193,12 @@ def _together(
 def _people_of(crowd: LoadedPeople, loaded: LoadedCamera) -> list[tuple[int, Keypoints]]:
     """Return the people of a film who are seen long enough, with their indices."""
     people: list[tuple[int, Keypoints]] = []
+    refusal: InputError | None = None
     for person in [person for person in crowd.by_prominence if len(crowd.tracks[person]) >= MIN_FRAMES][:MAX_PEOPLE]:
-        people.append((person, _straightened(crowd.keypoints(person).keypoints, loaded, crowd.name)))
+        try:
+            people.append((person, _straightened(crowd.keypoints(person).keypoints, loaded, crowd.name)))
+        except InputError as error:  # somebody at the edge of the image is not the person who is searched
+            refusal = refusal or error
+    if refusal is not None and not people:
+        raise refusal
     return people

@@ -16,8 +16,7 @@ import numpy as np
 from larp_model.errors import InputError
 from tasks.pose.camera import Camera
 from tasks.pose.points import Keypoints
-from tasks.pose.triangulation import OUTLIER
-from tasks.pose.views import MIN_FRAMES, Views
+from tasks.pose.views import MIN_FRAMES, OUTLIER, Views
 
 # Films have this share of the shorter one in common, and at least `MIN_FRAMES`.
 COMMON_SHARE = 0.4

@@ -8,10 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from tasks.pose.camera import Camera
-from tasks.pose.views import places_in_all
-
-# An image's place is an outlier where it is more standard deviations than this from the point's projection.
-OUTLIER = 6.0
+from tasks.pose.views import OUTLIER, places_in_all
 
 
 def triangulated(

@@ -17,6 +17,8 @@ from tasks.pose.space import Space
 Viewpoint = Camera | Space
 # Fewest frames that show a person.
 MIN_FRAMES = 10
+# A point's place is an outlier beyond this number of standard deviations, and counts less.
+OUTLIER = 6.0
 
 
 def places_in_all(cameras: Sequence[Viewpoint], points: Any) -> Any:
