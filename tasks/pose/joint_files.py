@@ -184,9 +184,8 @@ def _c3d(path: Path) -> _Recording:
             f"has {len(labels)} labels of {len(frames[0]) if frames else 0} points, but needs one for each"
         )
     values = np.array(frames, float)
-    points = np.where(
-        values[..., 3:] < 0.0, np.nan, values[..., :3]
-    )  # residuals below 0 are of points that are missing
+    missing = values[..., 3:] < 0.0  # a residual below 0 says so
+    points = np.where(missing, np.nan, values[..., :3])
     _require_some(points)
     return _Recording(labels[: points.shape[1]], points, rate if np.isfinite(rate) else None, unit)
 
