@@ -273,10 +273,15 @@ def beside(seen: Page, label: str) -> Locator:
 
 
 def enter(seen: Page, label: str, value: str) -> None:
-    """Type a number beside a slider."""
+    """Type a number beside a slider, anew where one that the page drew late came between selecting and typing."""
     number = beside(seen, label).last
-    number.fill(value)
-    number.press("Enter")
+
+    def typed() -> bool:
+        number.fill(value)
+        number.press("Enter")
+        return float(number.input_value() or "nan") == float(value)
+
+    until(typed)
 
 
 @pytest.mark.parametrize(("setting", "arrow"), [("spot", (0.28, 0.0, 0.0)), ("roll", (0.2, 0.0, 0.35))])
