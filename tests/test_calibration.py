@@ -102,6 +102,34 @@ def colmap(folder: Path) -> str:
     return "cameras.txt"
 
 
+def colmap_world(folder: Path) -> str:
+    """Lens and place in two files; every other line of images.txt lists what an image shows, or nothing."""
+    x, y, z, w = TURN.as_quat()
+    place = " ".join(map(repr, [*map(float, (w, x, y, z)), *(-TURN.apply(POSITION)).tolist()]))
+    images = f"# Image list\n1 1 0 0 0 0.5 1.5 4 3 cam_01/0001.png\n\n2 {place} 3 cam_02/0001.png\n7.5 8.5 -1\n"
+    (folder / "images.txt").write_text(images)
+    return f"{colmap(folder)}:cam_02"
+
+
+def qualisys(folder: Path, right: int = 1919) -> str:
+    """The camera in mm and 1/64 px, its axes to the right, up and back, as the lower right part of its sensor."""
+    rows = TURN.as_matrix() * [[1.0], [-1.0], [-1.0]]
+    turn = " ".join(f'r{row + 1}{column + 1}="{float(rows[row, column])!r}"' for row in range(3) for column in range(3))
+    k1, k2, p1, p2, k3 = DISTORTION
+    x, y, z = 1000.0 * POSITION
+    (u, v), (focal_u, focal_v) = 64.0 * (CENTRE + np.array([80.0, 8.0])), 64.0 * FOCAL
+    camera = f"""<camera active="1" serial="{{serial}}" model="{{model}}" viewrotation="0">
+        <fov_video left="80" top="8" right="{right + 80}" bottom="1087"/><transform x="{x}" y="{y}" z="{z}" {turn}/>
+        <intrinsic focallength="9.27" sensorMinU="0.0" sensorMaxU="127999.0" sensorMinV="0.0" sensorMaxV="69631.0"
+        focalLengthU="{focal_u}" focalLengthV="{focal_v}" centerPointU="{u}" centerPointV="{v}" skew="0.0"
+        radialDistortion1="{k1}" radialDistortion2="{k2}" radialDistortion3="{k3}" tangentalDistortion1="{p1}"
+        tangentalDistortion2="{p2}"/></camera>"""
+    marked = camera.format(serial="11111", model="Miqus M3"), camera.format(serial="26578", model="Miqus Video")
+    content = f"<?xml version='1.0' encoding='UTF-8'?>\n<calibration><cameras>{''.join(marked)}</cameras></calibration>"
+    (folder / "lab.qca.txt").write_text(content)
+    return "lab.qca.txt"
+
+
 # How each form is written, how many distortion coefficients it has, and whether it says where the camera is.
 FORMS: dict[str, tuple[Callable[[Path], str], int, bool]] = {
     "ours": (ours, 5, True),
@@ -110,6 +138,8 @@ FORMS: dict[str, tuple[Callable[[Path], str], int, bool]] = {
     "EasyMocap": (easymocap, 5, True),
     "Pose2Sim": (pose2sim, 4, True),
     "COLMAP": (colmap, 4, False),
+    "COLMAP, with places": (colmap_world, 4, True),
+    "Qualisys": (qualisys, 5, True),
 }
 
 
@@ -178,6 +208,10 @@ def test_points_that_a_lens_cannot_show_are_lost() -> None:
         ("lens.yml", "!!python/object/apply:os.getpid []\n", "lens.yml is no whole calibration file"),
         ("cameras.txt", "1 FISHEYE 3 4 5\n", "the model of a lens is 'FISHEYE', but must be one of SIMPLE_PINHOLE"),
         ("cameras.txt", "1 PINHOLE 3 4 5\n", "PINHOLE has 1 numbers, but needs 4"),
+        ("lab.qca.txt", "<calibration><cameras>", "lab.qca.txt is no whole calibration file .ParseError"),
+        ("lab.qca.txt", "<calibration/>", "lab.qca.txt has no camera"),
+        ("lab.qca.txt", '<c><cameras><camera serial="7"/></cameras></c>', "7 has no transform or no intrinsic"),
+        ("lab.qca.txt", '<!DOCTYPE c [<!ENTITY a "b">]><c/>', "entities of its own is no calibration"),
         ("camera.json", '{"focal": [1, 2, 3], "size": [4, 5]}', "focal is .1, 2, 3., but needs 2 finite numbers"),
         ("camera.json", '{"distortion": [1], "size": [4, 5]}', "distortion is .1., but needs 4 finite numbers"),
         ("camera.json", '{"rotation": [0, 0, 0], "size": [4, 5]}', "has rotation, but needs both or neither"),
@@ -198,3 +232,15 @@ def test_one_of_several_cameras_is_named(tmp_path: Path) -> None:
         cameras.load(f"{tmp_path / 'calib.toml'}:cam_2")
     with pytest.raises(InputError, match=r"no such file exists"):
         cameras.load(tmp_path / "none.toml:cam_01")
+
+
+def test_a_camera_that_moves_is_refused(tmp_path: Path) -> None:
+    colmap(tmp_path)
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 4 3 cam/1.png\n\n2 1 0 0 0 1 0 4 3 cam/2.png\n\n")
+    with pytest.raises(InputError, match=r"^camera: cam moves from image to image, but has to stand still$"):
+        cameras.load(tmp_path / "cameras.txt")
+
+
+def test_images_of_another_width_than_is_said_have_the_size_of_the_sensor(tmp_path: Path) -> None:
+    """Some tools write the first pixel that is no longer filmed as the last one."""
+    assert cameras.load(tmp_path / qualisys(tmp_path, right=1920)).size == SIZE

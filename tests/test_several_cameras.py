@@ -105,6 +105,16 @@ class TestTriangulation:
         np.testing.assert_allclose(found, points, atol=1e-6)
         np.testing.assert_allclose(distances[:, 2, 5], np.hypot(150.0, 150.0), rtol=1e-6)
 
+    def test_rays_that_hardly_meet_know_no_depth_but_give_numbers(self) -> None:
+        for seed in range(40):
+            random = np.random.default_rng(seed)
+            one = cameras.looking_at(random.normal(size=3) + np.array([0.0, 0.0, 4.0]), np.zeros(3), 800.0, SIZE)
+            two = Camera(one.focal, one.centre, one.turn, one.position + 1e-3 * random.normal(size=3))
+            places = random.uniform(200.0, 800.0, (3, 1, len(POINTS), 2)).repeat(2, axis=1)
+            places[:, 1] += 1e-5 * random.normal(size=places[:, 1].shape)
+            found, _ = triangulated([one, two], places, np.ones(places.shape[:3]), np.full(2, 4.0))
+            assert np.isfinite(found).all()
+
     def test_a_point_that_only_one_camera_sees_is_not_known(self) -> None:
         random = np.random.default_rng(4)
         points = random.uniform(-1.0, 1.0, (3, len(POINTS), 3)) + np.array([0.0, 0.0, 1.0])
@@ -215,6 +225,25 @@ class TestFiles:
         )
         loaded = sources.load([films["paths"][0], path], (50.0,), SIZE, camera_files=(films["cameras"],))
         assert any(note.startswith("right_side.json: person 0") for note in loaded.notes)
+
+    @pytest.mark.parametrize(
+        ("unit", "turn", "message"),
+        [
+            (3.0, Rotation.identity(), r"has legs of 2\.\d m: their positions need metres"),
+            (1.0, Rotation.from_euler("x", 90.0, degrees=True), r"stands along -y: their world needs z up"),
+        ],
+        ids=["another unit", "another axis up"],
+    )
+    def test_cameras_in_another_world_are_refused_by_whom_they_see(
+        self, films: dict[str, Any], unit: float, turn: Rotation, message: str
+    ) -> None:
+        moved = {
+            name: Camera(800.0, films[name].centre, films[name].turn @ turn.as_matrix().T,
+                         unit * turn.apply(films[name].position) + (0.0, 0.0, 9.0))
+            for name in ("left", "right")
+        }  # fmt: skip
+        with pytest.raises(InputError, match=f"^cameras: the person they see {message}$"):
+            sources.load(films["paths"], camera_files=(calibration(films["folder"], **moved),))
 
     def test_exchanged_cameras_are_refused_by_how_far_points_are_off(self, films: dict[str, Any]) -> None:
         files = [Path(f"{films['cameras']}:{name}") for name in ("right", "left")]

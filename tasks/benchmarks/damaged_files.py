@@ -134,6 +134,19 @@ def _write_pose2sim_camera(folder: Path) -> None:
     _write_text(folder / "calib.toml", f"[a]\n{lens}{place}")
 
 
+def _write_qualisys_camera(folder: Path) -> None:
+    place = 'x="0" y="-4000" z="1500" r11="1" r12="0" r13="0" r21="0" r22="0" r23="1" r31="0" r32="-1" r33="0"'
+    lens = 'sensorMaxU="81919" sensorMaxV="46079" focalLengthU="57600" focalLengthV="57600" centerPointU="40960"'
+    inner = f'<transform {place}/><intrinsic {lens} centerPointV="23040" radialDistortion1="-0.1"/>'
+    text = f'<calibration><cameras><camera serial="7" model="Video">{inner}</camera></cameras></calibration>'
+    _write_text(folder / "lab.qca.txt", text)
+
+
+def _write_colmap_camera(folder: Path) -> None:
+    _write_text(folder / "cameras.txt", "1 OPENCV 1280 720 900 900 640 360 -0.1 0.05 0.001 0.002\n")
+    _write_text(folder / "images.txt", "1 0.7071 -0.7071 0 0 0 1.5 4 1 a/1.png\n\n")
+
+
 def _write_kept_kick(folder: Path, kick: Kick) -> None:
     states = np.repeat(kick.start()[None], 4, axis=0)
     figures = dict.fromkeys(("model_error_m", "ball_speed_m_s", "reference_deviation_m"), 0.1)
@@ -205,6 +218,10 @@ def kinds() -> dict[str, FileKind]:
         "camera, JSON": FileKind(_write_camera, "camera.json", camera.load),
         "camera, YAML": FileKind(_write_opencv_lens, "lens.yml", camera.load),
         "camera, TOML": FileKind(_write_pose2sim_camera, "calib.toml", camera.load),
+        "camera, XML": FileKind(_write_qualisys_camera, "lab.qca.txt", camera.load),
+        "camera, text": FileKind(
+            _write_colmap_camera, "images.txt", lambda path: camera.load(path.with_name("cameras.txt"))
+        ),
         "joints, TRC": FileKind(_write_trc, "joints.trc", joint_files.load),
         "joints, C3D": FileKind(_write_c3d, "joints.c3d", joint_files.load),
         "joints, npz": FileKind(_write_joints, "joints.npz", joint_files.load),

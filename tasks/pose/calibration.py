@@ -6,9 +6,12 @@
 | OpenCV's YAML or JSON | one camera: `camera_matrix`, `distortion_coefficients`, `image_width`, ... | the lens |
 | EasyMocap's `intri.yml`, with `extri.yml` beside it | several cameras, by name | lens and place |
 | Pose2Sim's TOML | several cameras, by name | lens and place |
+| Qualisys' calibration (`.qca.txt`) | several cameras, by serial number | lens and place |
 | COLMAP's `cameras.txt` | several cameras, by number | the lens |
+| COLMAP's, with `images.txt` beside it | several cameras, by their images' folder or name | lens and place |
 
-Worlds of EasyMocap and Pose2Sim have z up, the ground at 0, and metres; those of OpenCV and COLMAP may be anything.
+Places count from a world with z up, the ground at 0, and metres, as EasyMocap, Pose2Sim and Qualisys (in mm) have it;
+COLMAP's may be any, and has to be brought there, for instance by its `model_aligner`.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import yaml
@@ -37,6 +41,12 @@ _COLMAP = {
     "RADIAL": (1, (0, 1)),
     "OPENCV": (2, (0, 1, 2, 3)),
 }
+# Qualisys' numbers in a pixel, and its axes of a camera, to the right, up, back, in ours: to the right, down, ahead.
+_SUBPIXELS, _QUALISYS = 64.0, np.diag([1.0, -1.0, -1.0])
+_QUALISYS_DISTORTION = (("radial", 1), ("radial", 2), ("tangental", 1), ("tangental", 2), ("radial", 3))
+
+
+_DAMAGE = (ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError, yaml.YAMLError, SyntaxError)
 
 
 def fields_of(path: str | Path) -> tuple[str, Fields]:
@@ -64,7 +74,7 @@ def _cameras_of(path: Path) -> dict[str, Fields]:
     require_file("camera", path)
     try:
         cameras = _cameras(path)
-    except (ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError, yaml.YAMLError) as error:
+    except _DAMAGE as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"camera: {path.name} is no whole calibration file ({_line(error)})") from None
@@ -88,8 +98,13 @@ def _cameras(path: Path) -> dict[str, Fields]:
                 return {"camera": _opencv(content)}
             other = path.with_name(path.name.replace("intri", "extri"))
             return _easymocap(content, _opencv_yaml(other) if other != path and other.is_file() else {})
-        case ".txt":
-            return _colmap(path.read_text("utf-8"))
+        case ".txt" | ".qca" | ".xml":
+            text = path.read_text("utf-8-sig")
+            if text.lstrip().startswith("<"):
+                return _qualisys(text)
+            other = path.with_name("images.txt")
+            images = other.read_text("utf-8") if other != path and other.is_file() else ""
+            return _colmap(text, images)
     try:
         content = json.loads(path.read_bytes())
     except (ValueError, RecursionError):
@@ -174,7 +189,49 @@ def _pose2sim(content: Mapping[str, Any]) -> dict[str, Fields]:
     return cameras
 
 
-def _colmap(text: str) -> dict[str, Fields]:
+def _qualisys(text: str) -> dict[str, Fields]:
+    if "<!ENTITY" in text:
+        raise InputError("camera: an XML file with entities of its own is no calibration")
+    found = ElementTree.fromstring(text).findall("cameras/camera")
+    films = [camera for camera in found if "video" in camera.get("model", "").lower()]  # the others see markers alone
+    return {camera.attrib["serial"]: _qualisys_camera(camera) for camera in films or found}
+
+
+def _qualisys_camera(camera: ElementTree.Element) -> Fields:
+    place, lens, view = (camera.find(name) for name in ("transform", "intrinsic", "fov_video"))
+    if place is None or lens is None:
+        raise InputError(f"camera: {camera.get('serial')} has no transform or no intrinsic, but needs both")
+    u, v, focal_u, focal_v = (
+        float(lens.attrib[name]) / _SUBPIXELS
+        for name in ("centerPointU", "centerPointV", "focalLengthU", "focalLengthV")
+    )
+    first, last = np.zeros(2), np.array([(float(lens.attrib[f"sensorMax{axis}"]) + 1.0) // _SUBPIXELS for axis in "UV"])
+    if view is not None:  # the part of the sensor that is filmed, its last pixel included
+        first = np.array([float(view.attrib[side]) for side in ("left", "top")])
+        last = np.minimum(last, [float(view.attrib[side]) + 1.0 for side in ("right", "bottom")])
+    distortion = [f"{kind}Distortion{number}" for kind, number in _QUALISYS_DISTORTION]
+    turn = _QUALISYS @ [[float(place.attrib[f"r{row}{column}"]) for column in "123"] for row in "123"]
+    position = np.array([float(place.attrib[axis]) for axis in "xyz"]) / 1000.0
+    matrix = np.array([[focal_u, 0.0, u - first[0]], [0.0, focal_v, v - first[1]], [0.0, 0.0, 1.0]])
+    inner = _lens(matrix, [float(lens.get(name, 0.0)) for name in distortion])
+    return inner | _plain({"size": last - first}) | _place(turn, -turn @ position)
+
+
+def _colmap(text: str, images: str) -> dict[str, Fields]:
+    lenses = _colmap_lenses(text)
+    lines = [line for line in images.splitlines() if not line.startswith("#")]
+    cameras: dict[str, Fields] = {}
+    for line in filter(str.strip, lines[::2]):  # every other line is of what an image shows
+        _, *numbers, lens, path = line.split(maxsplit=9)
+        w, x, y, z, *translation = map(float, numbers)
+        name = Path(path).parts[0] if "/" in path else Path(path).stem
+        camera = lenses[lens] | _place(Rotation.from_quat([x, y, z, w]).as_matrix(), translation)
+        if not np.allclose(cameras.setdefault(name, camera)["position"], camera["position"], atol=0.05):
+            raise InputError(f"camera: {name} moves from image to image, but has to stand still")
+    return cameras or lenses
+
+
+def _colmap_lenses(text: str) -> dict[str, Fields]:
     cameras = {}
     for line in text.splitlines():
         if not line.strip() or line.startswith("#"):

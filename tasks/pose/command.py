@@ -145,9 +145,9 @@ def main(
             of several cameras one each. The films may begin at different times. Or joints in space: TRC, C3D or npz.
         rate: frames a second of the film, where the file does not say; of several films one number, or each one's.
         cameras: file of the camera, which stands still: a calibration of OpenCV (YAML, JSON), EasyMocap, Pose2Sim
-            (TOML) or COLMAP, as FILE:NAME where it has several; or JSON with field_of_view (degrees) or focal (px),
-            size, centre, distortion and, where they are known, position and look_at or rotation; a phone's by default,
-            its height and tilt estimated. Of several films, one calibration with all cameras, or each one's.
+            (TOML), Qualisys or COLMAP, as FILE:NAME where it has several; or JSON with field_of_view (degrees) or focal
+            (px), size, centre, distortion and, where they are known, position and look_at or rotation; a phone's by
+            default, its height and tilt estimated. Of several films, one calibration with all cameras, or each one's.
         turned: degrees clockwise by which the images were turned after the camera was calibrated.
         size: width and height of the images (px), where neither file says.
         person: which of several in the first film, in order of appearance from 0; the one who is seen best by default.

@@ -220,13 +220,26 @@ def _of_both_sides(places: np.ndarray, limb: str) -> np.ndarray:
     return places[:, [POINTS.index(f"{side}_{limb}") for side in SIDES]]
 
 
-def _in_metres(places: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
-    """Return the places [m], and the unit they were in: the file's if the legs are a person's in it, else another."""
+def leg_length(places: np.ndarray) -> float:
+    """Return the length of the legs of a person's points (T, P, 3), in their unit; NaN if no leg is whole."""
     hips, knees, ankles = (_of_both_sides(places, limb) for limb in ("hip", "knee", "ankle"))
     lengths = np.linalg.norm(hips - knees, axis=-1) + np.linalg.norm(knees - ankles, axis=-1)
-    if not np.isfinite(lengths).any():
+    return float(np.median(lengths[np.isfinite(lengths)])) if np.isfinite(lengths).any() else np.nan
+
+
+def upwards(places: np.ndarray) -> np.ndarray:
+    """Return the direction (3,) from ankles to shoulders of a person's points (T, P, 3), NaN if never seen."""
+    ways = (_of_both_sides(places, "shoulder") - _of_both_sides(places, "ankle")).mean(axis=1)
+    known = ways[np.isfinite(ways).all(axis=-1)]
+    shares: np.ndarray = known / np.linalg.norm(known, axis=-1, keepdims=True)
+    return np.median(shares, axis=0) if len(known) else np.full(3, np.nan)
+
+
+def _in_metres(places: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
+    """Return the places [m], and the unit they were in: the file's if the legs are a person's in it, else another."""
+    length = leg_length(places)
+    if not np.isfinite(length):
         raise InputError("has no frame with a whole leg")
-    length = float(np.nanmedian(lengths))
     for candidate in sorted(UNITS, key=lambda other: other != unit.lower()):
         if LEGS[0] <= length * UNITS[candidate] <= LEGS[1]:
             return places * UNITS[candidate], candidate
@@ -235,11 +248,9 @@ def _in_metres(places: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
 
 def _upright(places: np.ndarray) -> tuple[np.ndarray, str]:
     """Return the places with z up, and the name of the axis that was up: the one along which people stand."""
-    upwards = (_of_both_sides(places, "shoulder") - _of_both_sides(places, "ankle")).mean(axis=1)
-    shares = upwards / np.linalg.norm(upwards, axis=-1, keepdims=True)
-    if not np.isfinite(shares).any():
+    share = upwards(places)
+    if not np.isfinite(share).all():
         raise InputError("has no frame with both shoulders and ankles")
-    share = np.nanmedian(shares, axis=0)
     axis = int(abs(share).argmax())
     if not abs(share[axis]) > UPRIGHT:
         raise InputError("has nobody who stands: which way is up is not known")

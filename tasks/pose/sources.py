@@ -175,7 +175,8 @@ def _together(
         when = "later" if found.delay > 0.0 else "earlier"
         notes.append(f"{crowd.name}: person {person}, began {abs(found.delay):.3f} s {when}")
     views = synchronised(films, [loaded.camera for loaded in lenses], delays)
-    _, distances = triangulated([loaded.camera for loaded in lenses], views.places, views.confidence, views.sigma)
+    points, distances = triangulated([loaded.camera for loaded in lenses], views.places, views.confidence, views.sigma)
+    _require_standing(points)
     notes += [
         f"{crowd.name}: half of its points are within {np.median(known):.1f} px of where the cameras together see them"
         for crowd, of_film in zip(crowds, np.moveaxis(distances, 1, 0), strict=True)
@@ -188,6 +189,18 @@ def _together(
         if share < FEW_FRAMES
     ]
     return views, notes
+
+
+def _require_standing(points: np.ndarray) -> None:
+    """Raise InputError where the cameras' world is not in metres, or z is not up, by the person in it (T, P, 3)."""
+    shortest, longest = joint_files.LEGS
+    if (length := joint_files.leg_length(points)) < shortest or length > longest:
+        raise InputError(f"cameras: the person they see has legs of {length:.2g} m: their positions need metres")
+    share = joint_files.upwards(points)
+    axis = int(abs(share).argmax())
+    if abs(share[axis]) > joint_files.UPRIGHT and (axis < 2 or share[axis] < 0.0):
+        sign = "-" if share[axis] < 0.0 else ""
+        raise InputError(f"cameras: the person they see stands along {sign}{'xyz'[axis]}: their world needs z up")
 
 
 def _people_of(crowd: LoadedPeople, loaded: LoadedCamera) -> list[tuple[int, Keypoints]]:

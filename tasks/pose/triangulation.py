@@ -70,6 +70,8 @@ def _solved(positions: np.ndarray, across: np.ndarray, weights: np.ndarray) -> n
     across: (T, C, P, 3, 3), projections onto the plane across each ray.
     """
     weighted = weights[..., None, None] * across
-    matrix, right_side = weighted.sum(axis=1) + 1e-9 * np.eye(3), (weighted @ positions[..., None]).sum(axis=1)
+    matrix, right_side = weighted.sum(axis=1), (weighted @ positions[..., None]).sum(axis=1)
+    # Rays that are parallel, or none, leave a direction open.
+    matrix += 1e-9 * (1.0 + weights.sum(axis=1)[..., None, None]) * np.eye(3)
     points: np.ndarray = np.linalg.solve(matrix, right_side)[..., 0]
     return points
