@@ -30,7 +30,7 @@ test: $(READY)
 quick: $(READY)
 	@$(RUN) pytest -n 2 --dist loadfile -m "not slow and not soak" tests
 
-# Thousands of random scenes and damaged files, some twenty minutes.
+# Thousands of random scenes and damaged files, some twenty minutes, and 200 random films, two hours.
 soak: $(READY)
 	@$(RUN) pytest -n 2 -m soak tests
 
