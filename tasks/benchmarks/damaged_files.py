@@ -144,7 +144,7 @@ def _write_qualisys_camera(folder: Path) -> None:
 
 def _write_colmap_camera(folder: Path) -> None:
     _write_text(folder / "cameras.txt", "1 OPENCV 1280 720 900 900 640 360 -0.1 0.05 0.001 0.002\n")
-    _write_text(folder / "images.txt", "1 0.7071 -0.7071 0 0 0 1.5 4 1 a/1.png\n\n")
+    _write_text(folder / "images.txt", "1 0.7071 0.7071 0 0 0 1.5 4 1 a/1.png\n\n")
 
 
 def _write_kept_kick(folder: Path, kick: Kick) -> None:
