@@ -42,7 +42,8 @@ class Recipe:
 
     curriculum: (unroll in steps, share of the updates) in order. learning_rate falls to `final` of itself by a cosine.
     clip: largest gradient norm. drop: norm beyond which a batch is dropped. contact_share: windows that start from
-    `before_contact` steps before the first contact of two bodies on. emphasis: weight of each body's links in the loss.
+    `before_contact` steps before the first contact of two bodies on. turned: turn windows at random about z, for models
+    that are not invariant. emphasis: weight of each body's links in the loss.
     """
 
     updates: int = 20000
@@ -54,6 +55,7 @@ class Recipe:
     drop: float = 30.0
     contact_share: float = 0.7
     before_contact: int = 10
+    turned: bool = True
     emphasis: tuple[tuple[str, float], ...] = (("ball", 3.0), ("capsule", 3.0))
     loss: LossWeights = field(default_factory=LossWeights)
     stop_gradient: bool = True
@@ -155,7 +157,7 @@ def statistics_of(model: Model, windows: Windows, random: np.random.Generator, b
     windows_of_steps = [windows.draw(random, 2) for _ in range(batches)]
     states, controls, torques, morphology = (np.concatenate(column) for column in zip(*windows_of_steps, strict=True))
     turns = rotation.random_turns(jax.random.key(int(random.integers(2**31))), len(states))
-    if not model.invariant:
+    if windows.recipe.turned and not model.invariant:
         states = np.asarray(rotation.turn_states(jnp.asarray(states), turns[:, None]))
     step = states[:, 0], states[:, 1], controls[:, 0], torques[:, 0], morphology
     statistics = jax.jit(model.measure)(*step)
@@ -211,7 +213,7 @@ def update_of(model: Model, recipe: Recipe, weights: Weights) -> Update:
     def update(
         networks: dict[str, Any], state: Any, key: Array, batch: Any, rate: float | Array
     ) -> tuple[dict[str, Any], Any, dict[str, Array]]:
-        if not model.invariant:
+        if recipe.turned and not model.invariant:
             turn = rotation.random_turns(key, len(batch.states))
             states = rotation.turn_states(batch.states, turn[:, None])
             batch = batch._replace(states=states, torques=rotation.about_z(batch.torques, turn[:, None, None]))
@@ -332,6 +334,8 @@ def _restored(manager: Any, recipe: Recipe, weights: Weights) -> tuple[TrainingS
     if manager.latest_step() is None:
         return training, weights
     restored = manager.restore(manager.latest_step(), args=ocp.args.StandardRestore((training, weights[1:])))
+    # Restored arrays are bound to one device, but a simulator may use several.
+    restored = jax.tree.map(lambda array: jnp.asarray(np.asarray(array)), restored)
     training = TrainingState(*restored[0])
     return training, Weights(training.networks, *restored[1])
 

@@ -19,7 +19,7 @@ from safetensors.numpy import save as serialise
 from larp_model.errors import InputError
 from larp_model.files import write_whole
 from larp_model.learned.model import Model, blank_weights
-from larp_model.learned.paper import PaperModel, Sizes, pairs_by_kind
+from larp_model.learned.paper import PaperModel, Sizes, Variant, pairs_by_kind
 from larp_model.learned.residual import ResidualModel
 from larp_model.names import require_file
 from larp_model.networks import Size, Statistics, Weights
@@ -41,6 +41,7 @@ KINDS: dict[str, Any] = {
     "pair": Pair,
     "paper": PaperModel,
     "paper's sizes": Sizes,
+    "paper's variant": Variant,
     "residual": ResidualModel,
     "scene": Scene,
     "size": Size,

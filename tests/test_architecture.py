@@ -201,6 +201,11 @@ ORDER = [
     "tasks.benchmarks.pose",
     "tasks.benchmarks.__main__",
     "tasks.benchmarks",
+    "tasks.experiments.changes",
+    "tasks.experiments.lists",
+    "tasks.experiments.runner",
+    "tasks.experiments.__main__",
+    "tasks.experiments",
     "tasks",
 ]
 PACKAGES = ("larp_model", "mpc", "viewer", "tasks")

@@ -1,0 +1,161 @@
+"""Experiments: variants of the paper's model, and a runner that goes on where it was cut off."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from larp_model import rotation
+from larp_model import state as packed
+from larp_model.engines.episodes import Episodes
+from larp_model.errors import InputError
+from larp_model.learned.model import Model, initial_weights
+from larp_model.learned.paper import PaperModel, Sizes, Variant
+from larp_model.networks import Size
+from larp_model.simulator import step
+from tasks.experiments import runner
+from tasks.experiments.changes import CHANGES, DESIGNS
+from tasks.experiments.lists import EXPERIMENTS, Trial
+from tasks.experiments.runner import BudgetSpentError, TrainedRun, chosen_runs, only_one_in, picture, table_of
+from tasks.scenarios import scenario
+
+LEAST = Sizes(*[Size(2, 16)] * 3)
+TINY = Trial("chain4", "paper", "unroll of 2 steps", 8, 0, 3)
+
+
+@pytest.fixture(scope="module")
+def thrown() -> dict[str, Episodes]:
+    """Truth of a chain, and of two that meet."""
+    return {name: scenario(name).draw(8, 1)[0] for name in ("chain4", "chains2")}
+
+
+def after(name: str, variant: Variant, given: Episodes, states: np.ndarray) -> np.ndarray:
+    """The states after a step by networks of random weights."""
+    model: Model = PaperModel(scenario(name).scene, LEAST, variant=variant)
+    arrays = (
+        given.states[:, 40],
+        given.states[:, 41],
+        np.zeros((len(states), 0, 3)),
+        given.torques[:, 0],
+        given.morphology,
+    )
+    *_, controls, torques, sizes = inputs = [jnp.asarray(array) for array in arrays]
+    measured = model.measure(*inputs)
+    weights = initial_weights(model, jax.random.key(0), measured)
+    moved = jax.jit(step, static_argnums=0)(model, weights, states, controls, torques, sizes)
+    return np.asarray(moved)
+
+
+@pytest.mark.parametrize("root_frame", [True, False])
+def test_turning_the_world_turns_a_step_in_the_roots_frame_alone(thrown: dict[str, Episodes], root_frame: bool) -> None:
+    given, variant = thrown["chain4"], Variant(contact="none", root_frame=root_frame, outputs="change")
+    states = jnp.asarray(given.states[:, 40])
+    turn = jnp.broadcast_to(jnp.array([jnp.cos(1.0), jnp.sin(1.0)]), (len(states), 2))
+    given = given._replace(torques=np.zeros_like(given.torques))
+    found = after("chain4", variant, given, np.asarray(rotation.turn_states(states, turn)))
+    expected = np.asarray(rotation.turn_states(jnp.asarray(after("chain4", variant, given, np.asarray(states))), turn))
+    difference = np.abs(np.delete(found - expected, np.s_[packed.ORIENTATION], axis=-1)).max()
+    assert (difference < 1e-4) == root_frame
+
+
+@pytest.mark.parametrize("contact", ["feature", "impulse", "none"])
+def test_only_with_a_contact_network_chains_change_each_other(thrown: dict[str, Episodes], contact: str) -> None:
+    given, variant = thrown["chains2"], Variant(contact=contact)  # type: ignore[arg-type]
+    together = given.states[:, 40].copy()
+    together[:, 2:, packed.POSITION] += together[:, :1, packed.POSITION] - together[:, 2:3, packed.POSITION]
+    apart = together.copy()
+    apart[:, 2:, 0] += 5.0
+    changes = [after("chains2", variant, given, states)[:, :2, packed.VELOCITY] for states in (together, apart)]
+    assert (np.abs(changes[0] - changes[1]).max() > 1e-6) == (contact != "none")
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"contact": "impuls"}, "variant.contact is 'impuls', .* did you mean 'impulse'"),
+        ({"left_out": ("torques",)}, "variant.left_out is 'torques', .* did you mean 'torque'"),
+        ({"root_frame": True}, "variant.root_frame is set, but needs rotation 'matrix' and contact 'none'"),
+    ],
+)
+def test_a_variant_that_does_not_exist_is_refused(fields: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Variant(**fields)  # type: ignore[arg-type]
+
+
+def test_every_run_changes_its_design_in_one_way_of_its_own() -> None:
+    made: dict[tuple[str, str], set[str]] = {}
+    for run in itertools.chain(*(experiment.runs for experiment in EXPERIMENTS.values())):
+        design, change = DESIGNS[run.design], CHANGES[run.change]
+        model = change.model(design.model(scenario(run.scene).scene))
+        made.setdefault((run.scene, run.design), set()).add(f"{model} {change.recipe(design.recipe)}")
+    for (scene, name), different in made.items():
+        runs = {run.change for experiment in EXPERIMENTS.values() for run in experiment.runs
+                if (run.scene, run.design) == (scene, name)}  # fmt: skip
+        assert len(different) == len(runs)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("ablation",), "experiment is 'ablation', .* did you mean 'ablations'"),
+        (("ablations", ("chain",)), "scenes is 'chain', .* did you mean 'chain4'"),
+        (("ablations", (), ("quaternion",)), "changes is 'quaternion', .* did you mean 'quaternions'"),
+        (("ablations", ("chain4",), ("contact impulse",)), "ablations has no run with it in chain4"),
+        (("ablations", (), (), 0), "seeds is 0, but must be at least 1"),
+        (("ablations", (), (), None, 0), "updates is 0, but must be at least 1"),
+    ],
+)
+def test_runs_that_do_not_exist_are_refused_with_the_nearest_names(arguments: tuple[str], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        chosen_runs(*arguments)
+
+
+def test_a_part_of_an_experiment_has_the_runs_that_are_asked_for() -> None:
+    runs = chosen_runs("ablations", ("chain4",), ("none", "quaternions"), 2, 50).runs
+    assert {run.scene for run in runs} == {"chain4"} and {run.change for run in runs} == {"none", "quaternions"}
+    assert {run.seed for run in runs} == {0, 1} and {run.updates for run in runs} == {50}
+
+
+def test_a_second_run_in_a_folder_is_refused(tmp_path: Path) -> None:
+    with only_one_in(tmp_path), pytest.raises(InputError, match="another run is in it"), only_one_in(tmp_path):
+        pass
+    with only_one_in(tmp_path):  # once the first one has ended
+        pass
+
+
+@pytest.mark.slow
+def test_a_run_is_trained_once_and_judged_by_its_errors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runner, "JUDGED", 6)
+    experiment = chosen_runs("ablations", ("chain4",), ("unroll of 2 steps",), 1)._replace(windows=(10, 40))
+    trained = TrainedRun(experiment, TINY, tmp_path, "ablations", time.monotonic() + 600.0)
+    row = trained()
+    assert row["sequences"] == 8 and row["judged"] == 6 and 0.0 < row["windows"]["10"]["chain"] < 20.0
+    again = trained()  # from the last checkpoint, which is that of all updates
+    assert again["windows"] == row["windows"] and again["seconds"] < row["seconds"]
+    with pytest.raises(InputError, match=r"updates is 4, but the run in .* was begun with 3"):
+        TrainedRun(experiment, TINY._replace(updates=4), tmp_path, "ablations", time.monotonic() + 600.0)()
+    with pytest.raises(BudgetSpentError):
+        TrainedRun(experiment, TINY, tmp_path, "ablations", time.monotonic() - 1.0)()
+
+
+def test_tables_say_mean_and_spread_and_what_diverged() -> None:
+    experiment = chosen_runs("ablations", ("chain4",), ("none", "12 layers"))._replace(windows=(10, 190))
+    rows = [
+        {"scene": "chain4", "design": "paper", "change": change, "sequences": 8, "seed": seed, "seconds": 7.0,
+         "windows": {"10": {"chain": 0.01}, "190": {"chain": error}}, "displacement_m": 0.001, "diverged": seed,
+         "judged": 4}
+        for change, errors in (("none", (0.2, 0.4)), ("12 layers", (0.3, None))) for seed, error in enumerate(errors)
+    ]  # fmt: skip
+    table = table_of(experiment, rows)
+    cells = [list(column.cells) for column in table.columns]
+    assert cells[0] == ["chain4, paper", "chain4, paper, 12 layers"]
+    assert cells[2] == ["0.300 ± 0.100", "diverged"] and cells[4] == ["12 %", "12 %"]
+    assert cells[-1] == ["0.11 m", ""]
+    (axes,) = picture(experiment, rows).axes
+    assert [text.get_text() for text in axes.get_yticklabels()] == ["paper", "paper, 12 layers"]
