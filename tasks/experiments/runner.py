@@ -35,7 +35,7 @@ DATA_SEED, JUDGED = 100, 256
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 
 Key = tuple[str, str, str, int]
-"""What runs of several seeds have in common: scene, design, change, sequences."""
+"""Scene, design, change and sequences: those of several seeds have them in common."""
 
 
 class BudgetSpentError(Exception):
