@@ -62,7 +62,9 @@ def test_every_command_of_the_documents_takes_what_it_is_given(line: list[str]) 
         given = [module.rpartition(".")[2], *given]
         tyro.extras.subcommand_cli_from_dict({name: idle(main) for name, main in NAMED.items()}, args=given)
     elif given not in (["--help"], ["--tyro-print-completion", "bash"]):
-        module = {"tasks.pose": "tasks.pose.command"}.get(module, module)
+        module = {"tasks.pose": "tasks.pose.command", "tasks.experiments": "tasks.experiments.runner"}.get(
+            module, module
+        )
         tyro.cli(idle(import_module(module).main), args=given)
 
 
