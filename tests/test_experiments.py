@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import jax
@@ -19,7 +20,8 @@ from larp_model.learned.model import Model, initial_weights
 from larp_model.learned.paper import PaperModel, Sizes, Variant
 from larp_model.networks import Size
 from larp_model.simulator import step
-from tasks.experiments import runner
+from tasks.benchmarks import engines, report
+from tasks.experiments import runner, speed
 from tasks.experiments.changes import CHANGES, DESIGNS
 from tasks.experiments.lists import EXPERIMENTS, Trial
 from tasks.experiments.runner import BudgetSpentError, TrainedRun, chosen_runs, only_one_in, picture, table_of
@@ -159,3 +161,37 @@ def test_tables_say_mean_and_spread_and_what_diverged() -> None:
     assert cells[-1] == ["0.11 m", ""]
     (axes,) = picture(experiment, rows).axes
     assert [text.get_text() for text in axes.get_yticklabels()] == ["paper", "paper, 12 layers"]
+
+
+def timed(engine: str, substeps: int, batch: int, ms: float | None) -> report.Row:
+    refused = None if ms else "is not installed"
+    return {"engine": engine, "scene": "human", "reach": None, "substeps": substeps, "batch": batch,
+            "gradient": False, "device": "cpu", "refused": refused, "ms_per_step": ms}  # fmt: skip
+
+
+def test_speed_is_shown_beside_the_papers_in_milliseconds_and_in_simulated_seconds() -> None:
+    rows = [timed("larp", 1, 1, 0.05), timed("larp", 1, 4096, 16.0), timed("mjwarp", 20, 1, None)]
+    cells = [list(column.cells) for column in speed.speed_table(rows, (1, 4096)).columns]
+    assert cells[0][:3] == ["LARP", "MuJoCo Warp 20", "LARP, the paper"]
+    assert cells[2][:3] == ["0.05", "is not installed", "0.07"] and cells[3][:3] == ["16", "", "1.3"]
+    cells = [list(column.cells) for column in speed.rate_table(rows, (1, 4096)).columns]
+    assert cells[0][0] == "LARP" and cells[1][0] == "200" and cells[2][0] == "2.56e+03"
+    assert cells[0][1] == "LARP, the paper", "what was refused has no rate"
+
+
+@pytest.mark.parametrize("engine", ["networks", "networks bfloat16"])
+def test_the_papers_networks_are_timed_at_their_own_size(engine: str) -> None:
+    row = engines.answer(engines.Question(engine, "ball", None, 1, 2))
+    assert row["refused"] is None and row["finite"] and row["ms_per_step"] > 0.0
+
+
+@pytest.mark.skipif(find_spec("mujoco_warp") is not None, reason="MuJoCo Warp is installed, and compiles for minutes")
+def test_without_mujoco_warp_its_row_says_so() -> None:
+    assert (
+        engines.answer(engines.Question("mjwarp", "ball", None, 20, 2))["refused"] == "is not installed (mujoco_warp)"
+    )
+
+
+def test_a_speed_of_no_batch_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="batch is '0'"):
+        runner.main("speed", batch="0", folder=tmp_path)

@@ -31,6 +31,7 @@ from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from mpc.dynamics import BatchedTruth
 from tasks.benchmarks import report
+from tasks.benchmarks.further_engines import WarpTruth, networks_of_paper
 from tasks.motions.references import embedded
 
 # A row is the median of `RUNS` runs of `STEPS` steps, or of as many as fit into `SECONDS`.
@@ -53,7 +54,12 @@ NAMES = {
     "mjx": "MJX",
     **{f"brax {pipeline}": f"Brax {pipeline}" for pipeline in PIPELINES},
     "bullet": "Bullet",
+    "mjwarp": "MuJoCo Warp",
+    "networks": "the paper's networks",
+    "networks bfloat16": "the paper's networks, products in bfloat16",
 }
+# Models that have no engine steps.
+LEARNED = ("larp", "networks", "networks bfloat16")
 
 Leaves = Any
 
@@ -77,7 +83,7 @@ class Question:
     @property
     def coarse(self) -> bool:
         """Return whether a kick is not converged with this engine at this number of engine steps."""
-        return self.engine != "larp" and self.substeps < SUBSTEPS
+        return self.engine not in LEARNED and self.substeps < SUBSTEPS
 
     @property
     def name(self) -> str:
@@ -87,8 +93,8 @@ class Question:
 
 
 def titled(engine: str, substeps: int) -> str:
-    """Return an engine's name with its engine steps; LARP's without."""
-    return NAMES[engine] if engine == "larp" else f"{NAMES[engine]} {substeps}"
+    """Return an engine's name with its engine steps, if it has some."""
+    return NAMES[engine] if engine in LEARNED else f"{NAMES[engine]} {substeps}"
 
 
 def case(scene: str, reach: str | None) -> str:
@@ -152,12 +158,16 @@ class Traced(NamedTuple):
 
 def larp(scene: Scene, substeps: int) -> Traced:
     """Return LARP's simulator of physics alone."""
-    simulator = Simulator.of_physics(scene)
+    return _of_states(Simulator.of_physics(scene).step)
+
+
+def _of_states(step: Callable[[Array, Array], Array]) -> Traced:
+    """Return the functions of a model of states (N, L, 13), by its step."""
 
     def ball(state: Array) -> Array:
         return jnp.concatenate([state[:, -1, packed.POSITION], state[:, -1, packed.VELOCITY]], axis=-1)
 
-    return Traced(partial(jnp.asarray, dtype=jnp.float32), lambda start: start, simulator.step, ball)
+    return Traced(partial(jnp.asarray, dtype=jnp.float32), lambda start: start, step, ball)
 
 
 def mjx(scene: Scene, substeps: int) -> Traced:
@@ -234,10 +244,12 @@ def mujoco(scene: Scene, substeps: int, batch: int) -> BatchedTruth:
 
 TRACED: dict[str, Callable[[Scene, int], Traced]] = {
     "larp": larp,
+    "networks": lambda scene, _: _of_states(networks_of_paper(scene)),
+    "networks bfloat16": lambda scene, _: _of_states(networks_of_paper(scene, "bfloat16")),
     "mjx": mjx,
     **{f"brax {pipeline}": partial(brax, pipeline) for pipeline in PIPELINES},
 }
-STEPPED: dict[str, Callable[[Scene, int, int], BatchedTruth]] = {"mujoco": mujoco, "bullet": bullet}
+STEPPED: dict[str, Callable[[Scene, int, int], Any]] = {"mujoco": mujoco, "bullet": bullet, "mjwarp": WarpTruth}
 
 
 class RefusedError(Exception):
@@ -389,7 +401,7 @@ def finite(leaves: Leaves) -> bool:
 
 def time_stepped(question: Question, workload: Course) -> report.Row:
     """Measure a step of an engine outside JAX; resetting it to its start is not counted."""
-    engine: Any = STEPPED[question.engine](workload.scene, question.substeps, question.batch)
+    engine = STEPPED[question.engine](workload.scene, question.substeps, question.batch)
     period = workload.controls.shape[1]
     last = workload.states
 

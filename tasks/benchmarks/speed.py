@@ -26,15 +26,20 @@ from rich.table import Table
 from larp_model.engines.mujoco import SUBSTEPS as CONVERGED
 from larp_model.errors import InputError
 from tasks.benchmarks import replays, report
-from tasks.benchmarks.engines import NAMES, PIPELINES, Question, case, titled
+from tasks.benchmarks.engines import LEARNED, NAMES, PIPELINES, Question, case, titled
 from tasks.command import prepare_jax, run
 from tasks.kick import Kick
 from tasks.presets import PresetName
 from tasks.session import Session
 from tasks.targets import random_kick
 
-# Engine steps in a step, by engine; all of Brax's pipelines have the same.
-SUBSTEPS = {"larp": (1,), "mujoco": (2, 4, 5, 10, 20, 40), "mjx": (20,), "brax": (20,), "bullet": (20,)}
+# Engine steps in a step, by engine; all of Brax's pipelines have the same. Those that replay kicks: Brax supports no
+# human, MJX and MuJoCo Warp are MuJoCo again, and the paper's networks are timed untrained.
+SUBSTEPS = {
+    "larp": (1,), "mujoco": (2, 4, 5, 10, 20, 40), "mjx": (20,), "brax": (20,), "bullet": (20,), "mjwarp": (20,),
+    "networks": (1,), "networks bfloat16": (1,),
+}  # fmt: skip
+REPLAYING = ("larp", "mujoco", "bullet")
 # Further engine steps, with which kicks are replayed beside the above.
 MORE = {"mujoco": (80,), "bullet": (5,)}
 CASES = {
@@ -53,7 +58,8 @@ SECONDS = {False: 120.0, True: 300.0}
 SLOW = 0.5
 PRESET: PresetName = "fast"
 STYLES = {"spring": "--", "positional": ":"}
-COLOURS = {"larp": "#d55e00", "mujoco": "#0072b2", "mjx": "#009e73", "brax": "#cc79a7", "bullet": "#7f7f7f"}
+COLOURS = {"larp": "#d55e00", "mujoco": "#0072b2", "mjx": "#009e73", "brax": "#cc79a7", "bullet": "#7f7f7f",
+           "mjwarp": "#56b4e9", "networks": "#e69f00"}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -164,14 +170,11 @@ class QuestionRunner:
 
 
 def replayed_by(engines: Sequence[str]) -> list[replays.Engine]:
-    """Return the engines that replay kicks, with their engine steps.
-
-    Brax is left out because it supports no human, MJX because it is MuJoCo again.
-    """
+    """Return the engines that replay kicks, with their engine steps."""
     return [
         (engine, substeps)
         for engine in engines
-        if engine not in ("brax", "mjx")
+        if engine in REPLAYING
         for substeps in (*SUBSTEPS[engine], *MORE.get(engine, ()))
     ]
 
@@ -304,7 +307,7 @@ def draw(axes: Axes, engine: str, lines: dict[int, Curve]) -> tuple[str, Line2D]
     """Draw an engine's line with a band from its fewest to its most engine steps; return its name and the line."""
     colour, style = COLOURS[engine.split()[0]], STYLES.get(engine.split()[-1], "-")
     substeps = CONVERGED if CONVERGED in lines else max(lines)
-    name = NAMES[engine] if engine == "larp" else f"{NAMES[engine]}, {substeps} engine steps"
+    name = NAMES[engine] if engine in LEARNED else f"{NAMES[engine]}, {substeps} engine steps"
     if len(lines) > 1:
         low, high = lines[min(lines)], lines[max(lines)]
         shared = [size for size in low if size in high]
@@ -357,7 +360,7 @@ def main(
 
     Args:
         scenes: of ball, human and human_ball, with commas between them.
-        engines: of larp, mujoco, mjx, brax and bullet, with commas between them.
+        engines: of larp, mujoco, mjx, brax, bullet, mjwarp, networks and networks bfloat16, with commas between them.
         batch: simulations side by side, with commas between them.
         kicks: how many are replayed; 0 for none. They need the scene human_ball.
         seed: of joint targets, kicks and planner.

@@ -25,6 +25,7 @@ from larp_model.simulator import Simulator
 from tasks.benchmarks import report
 from tasks.command import prepare_jax
 from tasks.episodes.chains import thrown_episodes
+from tasks.experiments import speed
 from tasks.experiments.changes import CHANGES, DESIGNS
 from tasks.experiments.lists import EXPERIMENTS, Experiment, Trial
 from tasks.scenarios import scenario
@@ -49,21 +50,26 @@ def main(
     seeds: int | None = None,
     updates: int | None = None,
     minutes: float = 170.0,
+    batch: str = speed.BATCHES,
     folder: Path = Path("runs/experiments"),
     publish: bool = False,
 ) -> None:
     """Train and judge the runs of an experiment; the same command goes on where it was cut off.
 
     Args:
-        name: ablations, data or supertrack.
+        name: ablations, data, supertrack or speed.
         scenes: only runs in these.
         changes: only runs with these changes; "none" is the design as it is.
         seeds: only so many of each run.
         updates: of every run, instead of the experiment's own.
         minutes: after which no further run is begun.
+        batch: of speed, simulations side by side, with commas between them.
         folder: where runs keep their data, checkpoints and logs for TensorBoard.
         publish: put the table into RESULTS.md.
     """
+    require_known("experiment", name, (*EXPERIMENTS, "speed"))
+    if name == "speed":
+        return speed.measure_speed(batch, folder, publish)
     experiment = chosen_runs(name, scenes, changes, seeds, updates)
     if not minutes > 0.0:
         raise InputError(f"minutes is {minutes:g}, but must be above 0")
