@@ -83,6 +83,13 @@ def person(points: np.ndarray) -> dict[str, Any]:
     return {"category_id": 1, "keypoints": rows.ravel().tolist(), "score": 2.5}
 
 
+@pytest.mark.parametrize("frames", [1, 4, 5, 40])
+def test_a_synthetic_film_has_as_many_frames_as_it_is_given(kick: np.ndarray, frames: int) -> None:
+    camera = cameras_around(np.random.default_rng(0), kick, 1)[0]
+    film = synthetic_film.detected(np.random.default_rng(1), camera, kick[:frames], 50.0)
+    assert film.places.shape == (frames, len(POINTS), 2) and film.detected.any()
+
+
 class TestTriangulation:
     @settings(max_examples=20)
     @given(seeds, st.integers(2, 5))

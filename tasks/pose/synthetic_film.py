@@ -74,9 +74,9 @@ def detected(
     Errors are partly independent between frames, partly correlated over some. Confidence falls with the error.
     """
     frames, count = points.shape[:2]
-    correlated_noise = np.array(
-        [np.convolve(signal, np.ones(5) / np.sqrt(5.0), "same") for signal in _normal(random, 2 * count, frames)]
-    )
+    window = np.ones(5) / np.sqrt(5.0)
+    signals = _normal(random, 2 * count, frames)
+    correlated_noise = np.array([np.convolve(signal, window, "same")[:frames] for signal in signals])
     error = 0.8 * random.standard_normal((frames, count, 2)) + 0.6 * correlated_noise.T.reshape(frames, count, 2)
     places = camera.project(points) + noise.pixels * error
     confidence = np.clip(0.95 - 0.12 * np.linalg.norm(error, axis=-1) + 0.05 * _normal(random, frames, count), 0.1, 1.0)
