@@ -180,7 +180,7 @@ ORDER = [
     "tasks.benchmarks.gap",
     "tasks.benchmarks.model",
     "tasks.benchmarks.reference",
-    "tasks.benchmarks.further_engines",
+    "tasks.benchmarks.gpu_engines",
     "tasks.benchmarks.engines",
     "tasks.benchmarks.replays",
     "tasks.benchmarks.speed",

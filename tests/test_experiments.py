@@ -24,7 +24,7 @@ from tasks.benchmarks import engines, report
 from tasks.experiments import runner, speed
 from tasks.experiments.changes import CHANGES, DESIGNS
 from tasks.experiments.lists import EXPERIMENTS, Trial
-from tasks.experiments.runner import BudgetSpentError, TrainedRun, chosen_runs, only_one_in, picture, table_of
+from tasks.experiments.runner import BudgetSpentError, TrialRunner, chosen_runs, only_one_in, picture, table_of
 from tasks.scenarios import scenario
 
 LEAST = Sizes(*[Size(2, 16)] * 3)
@@ -135,15 +135,15 @@ def test_a_second_run_in_a_folder_is_refused(tmp_path: Path) -> None:
 def test_a_run_is_trained_once_and_judged_by_its_errors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runner, "JUDGED", 6)
     experiment = chosen_runs("ablations", ("chain4",), ("unroll of 2 steps",), 1)._replace(windows=(10, 40))
-    trained = TrainedRun(experiment, TINY, tmp_path, "ablations", time.monotonic() + 600.0)
+    trained = TrialRunner(experiment, TINY, tmp_path, "ablations", time.monotonic() + 600.0)
     row = trained()
     assert row["sequences"] == 8 and row["judged"] == 6 and 0.0 < row["windows"]["10"]["chain"] < 20.0
     again = trained()  # from the last checkpoint, which is that of all updates
     assert again["windows"] == row["windows"] and again["seconds"] < row["seconds"]
     with pytest.raises(InputError, match=r"updates is 4, but the run in .* was begun with 3"):
-        TrainedRun(experiment, TINY._replace(updates=4), tmp_path, "ablations", time.monotonic() + 600.0)()
+        TrialRunner(experiment, TINY._replace(updates=4), tmp_path, "ablations", time.monotonic() + 600.0)()
     with pytest.raises(BudgetSpentError):
-        TrainedRun(experiment, TINY, tmp_path, "ablations", time.monotonic() - 1.0)()
+        TrialRunner(experiment, TINY, tmp_path, "ablations", time.monotonic() - 1.0)()
 
 
 def test_tables_say_mean_and_spread_and_what_diverged() -> None:

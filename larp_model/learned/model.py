@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, Protocol, Self
 
 import jax
@@ -68,16 +69,19 @@ def initial_weights(model: Model, key: Array, statistics: Measured) -> Weights:
     return Weights(networks, inputs, outputs)
 
 
+def untrained_weights(model: Model, key: Array) -> Weights:
+    """Return fresh networks of a model, with statistics of its bodies at rest."""
+    scene = model.scene
+    state = (
+        jnp.zeros((1, len(scene.links), packed.SIZE)).at[..., packed.ORIENTATION].set(jnp.array([1.0, 0.0, 0.0, 0.0]))
+    )
+    control, torque = jnp.zeros((1, len(scene.motors), 3)), jnp.zeros((1, len(scene.links), 3))
+    sizes = jnp.asarray(scene.morphology[None], jnp.float32)
+    return initial_weights(model, key, model.measure(state, state, control, torque, sizes))
+
+
 def blank_weights(model: Model) -> Weights:
     """Return the shapes and types of a model's weights."""
-    scene = model.scene
-
-    def weights() -> Weights:
-        state = jnp.zeros((1, len(scene.links), packed.SIZE))
-        control, torque = jnp.zeros((1, len(scene.motors), 3)), jnp.zeros((1, len(scene.links), 3))
-        sizes = jnp.zeros((1, len(scene.links), 3))
-        return initial_weights(model, jax.random.key(0), model.measure(state, state, control, torque, sizes))
-
-    blank = jax.eval_shape(weights)
+    blank = jax.eval_shape(partial(untrained_weights, model), jax.random.key(0))
     assert isinstance(blank, Weights)
     return blank

@@ -129,15 +129,14 @@ class PaperModel:
         after = []
         for body in scene.bodies:
             name, body_links, effect = network_name("dynamics", body), by_body[body.name], effects[body.name]
-            scaled = effect[..., :3] / self.scale[0], effect[..., 3:] / self.scale[1]
-            impulse = jnp.stack(scaled, axis=1) if self.variant.contact == "impulse" else jnp.zeros(())
-            if self.variant.contact != "feature":
-                scaled = jnp.zeros_like(scaled[0]), jnp.zeros_like(scaled[1])
+            effect = jnp.stack([effect[..., :3] / self.scale[0], effect[..., 3:] / self.scale[1]], axis=1)
+            nothing, is_impulse = jnp.zeros_like(effect), self.variant.contact == "impulse"
             rows, motors = scene.rows(body.name), scene.motor_rows(body.name)
             inputs, turn = self.body_inputs(body, body_links, control[:, motors], torque[:, rows])
-            outputs = bounded(evaluate(networks[name], weights, name, side_by_side(inputs, *scaled)), self.bound)
+            inputs = side_by_side(inputs, nothing if is_impulse else effect)
+            outputs = bounded(evaluate(networks[name], weights, name, inputs), self.bound)
             vectors = weights.outputs[name].restore(outputs).reshape(len(state), 2, len(body.links), 3)
-            velocities = rotation.about_z(vectors, turn[:, None, None]) + impulse
+            velocities = rotation.about_z(vectors, turn[:, None, None]) + (effect if is_impulse else nothing)
             before = state[:, rows]
             if self.variant.outputs == "change":
                 velocities += _velocities(before)

@@ -31,7 +31,7 @@ from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from mpc.dynamics import BatchedTruth
 from tasks.benchmarks import report
-from tasks.benchmarks.further_engines import WarpTruth, networks_of_paper
+from tasks.benchmarks.gpu_engines import WarpTruth, networks_of_paper
 from tasks.motions.references import embedded
 
 # A row is the median of `RUNS` runs of `STEPS` steps, or of as many as fit into `SECONDS`.

@@ -17,8 +17,8 @@ from tasks.train import ALGORITHM_1, OVER_PHYSICS
 # A quarter of the paper's widths and half of its layers: what two cores can train many times.
 SMALL = Sizes(Size(6, 128, skip=False), Size(6, 64, skip=False), Size(4, 64, skip=False))
 # Unroll in steps, share of the updates: the paper's longest at last, of few lengths, since each is compiled.
-GROWING = ((2, 0.2), (6, 0.2), (12, 0.2), (20, 0.4))
-OF_NETWORKS = replace(ALGORITHM_1, curriculum=GROWING, learning_rate=1e-3)
+UNROLLS = ((2, 0.2), (6, 0.2), (12, 0.2), (20, 0.4))
+OF_NETWORKS = replace(ALGORITHM_1, curriculum=UNROLLS, learning_rate=1e-3)
 
 
 class Design(NamedTuple):

@@ -83,7 +83,7 @@ def main(
     command = f"python -m tasks.experiments {name}{options}"
     deadline = time.monotonic() + 60.0 * minutes
     with only_one_in(folder / name):
-        jobs = {run.name: TrainedRun(experiment, run, folder, name, deadline) for run in experiment.runs}
+        jobs = {run.name: TrialRunner(experiment, run, folder, name, deadline) for run in experiment.runs}
         try:
             rows = report.collect(path, command, jobs)
         except BudgetSpentError:
@@ -138,11 +138,11 @@ def only_one_in(folder: Path) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class TrainedRun:
-    """Training of an experiment, which trains when it is called; see `main`. deadline: of the monotonic clock [s]."""
+class TrialRunner:
+    """Runner of one trial of an experiment; see `main`. deadline: of the monotonic clock [s]."""
 
     experiment: Experiment
-    run: Trial
+    trial: Trial
     folder: Path
     name: str
     deadline: float
@@ -151,32 +151,32 @@ class TrainedRun:
         """Return the run's figures; raise BudgetSpentError if the deadline is past."""
         if time.monotonic() > self.deadline:
             raise BudgetSpentError
-        run, chosen, design = self.run, scenario(self.run.scene), DESIGNS[self.run.design]
-        change, folder = CHANGES[run.change], self.folder / self.name / self.run.name
+        trial, chosen, design = self.trial, scenario(self.trial.scene), DESIGNS[self.trial.design]
+        change, folder = CHANGES[trial.change], self.folder / self.name / self.trial.name
         model = change.model(design.model(chosen.scene))
-        recipe = replace(change.recipe(design.recipe), updates=run.updates, seed=run.seed)
+        recipe = replace(change.recipe(design.recipe), updates=trial.updates, seed=trial.seed)
         folder.mkdir(parents=True, exist_ok=True)
-        claim(folder, {**run._asdict(), "made by": repr((model, recipe))})
-        episodes = self.episodes(run.sequences, DATA_SEED, 200)
+        claim(folder, {**trial._asdict(), "made by": repr((model, recipe))})
+        episodes = self.episodes(trial.sequences, DATA_SEED, 200)
         weights, log = training.train(model, recipe, [(episodes, 1.0)], folder, quiet=True)
         judged = self.episodes(JUDGED, EVALUATION_SEED, self.experiment.steps)
         scores = evaluation.evaluate(Simulator.of(model, weights), judged, self.experiment.windows)
         scores.pop("launch")
         return {
-            **run._asdict(),
+            **trial._asdict(),
             "seconds": log["seconds"],
             "dropped": log["dropped"],
             **scores,
-            "sequences": run.sequences,
+            "sequences": trial.sequences,
             "judged": scores["sequences"],
         }
 
     def episodes(self, count: int, seed: int, steps: int) -> Episodes:
         """Return ground-truth episodes of the run's scene, which are drawn once for all runs."""
-        chosen = scenario(self.run.scene)
+        chosen = scenario(self.trial.scene)
         folder = self.folder / "data"
         folder.mkdir(exist_ok=True)
-        path = folder / f"{self.run.scene}_{count}_{steps}_seed_{seed}.npz"
+        path = folder / f"{self.trial.scene}_{count}_{steps}_seed_{seed}.npz"
         return stored_episodes(
             path,
             chosen.scene,

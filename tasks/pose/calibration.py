@@ -44,8 +44,7 @@ _COLMAP = {
 # Qualisys' numbers in a pixel, and its axes of a camera, to the right, up, back, in ours: to the right, down, ahead.
 _SUBPIXELS, _QUALISYS = 64.0, np.diag([1.0, -1.0, -1.0])
 _QUALISYS_DISTORTION = (("radial", 1), ("radial", 2), ("tangental", 1), ("tangental", 2), ("radial", 3))
-
-
+# Errors that readers raise on damaged files; that of XML is a SyntaxError.
 _DAMAGE = (ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError, yaml.YAMLError, SyntaxError)
 
 

@@ -235,6 +235,14 @@ def upwards(places: np.ndarray) -> np.ndarray:
     return np.median(shares, axis=0) if len(known) else np.full(3, np.nan)
 
 
+def axis_along(direction: np.ndarray) -> str | None:
+    """Return the axis along which a direction (3,) mostly points, such as "z" or "-y"; None if there is none."""
+    axis = int(abs(direction).argmax())
+    if not abs(direction[axis]) > UPRIGHT:
+        return None
+    return f"{'-' if direction[axis] < 0.0 else ''}{'xyz'[axis]}"
+
+
 def _in_metres(places: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
     """Return the places [m], and the unit they were in: the file's if the legs are a person's in it, else another."""
     length = leg_length(places)
@@ -251,14 +259,14 @@ def _upright(places: np.ndarray) -> tuple[np.ndarray, str]:
     share = upwards(places)
     if not np.isfinite(share).all():
         raise InputError("has no frame with both shoulders and ankles")
-    axis = int(abs(share).argmax())
-    if not abs(share[axis]) > UPRIGHT:
+    along = axis_along(share)
+    if along is None:
         raise InputError("has nobody who stands: which way is up is not known")
-    turned = np.roll(places, 2 - axis, axis=-1)  # the axes keep their order, and with it left and right
-    if share[axis] < 0.0:
+    turned = np.roll(places, 2 - "xyz".index(along[-1]), axis=-1)  # axes keep their order, and with it left and right
+    if along.startswith("-"):
         turned = turned * (1.0, -1.0, -1.0)
     _require_own_sides(turned)
-    return turned, f"{'-' if share[axis] < 0.0 else ''}{'xyz'[axis]}"
+    return turned, along
 
 
 def _require_own_sides(places: np.ndarray) -> None:

@@ -196,11 +196,8 @@ def _require_standing(points: np.ndarray) -> None:
     shortest, longest = joint_files.LEGS
     if (length := joint_files.leg_length(points)) < shortest or length > longest:
         raise InputError(f"cameras: the person they see has legs of {length:.2g} m: their positions need metres")
-    share = joint_files.upwards(points)
-    axis = int(abs(share).argmax())
-    if abs(share[axis]) > joint_files.UPRIGHT and (axis < 2 or share[axis] < 0.0):
-        sign = "-" if share[axis] < 0.0 else ""
-        raise InputError(f"cameras: the person they see stands along {sign}{'xyz'[axis]}: their world needs z up")
+    if (along := joint_files.axis_along(joint_files.upwards(points))) not in (None, "z"):
+        raise InputError(f"cameras: the person they see stands along {along}: their world needs z up")
 
 
 def _people_of(crowd: LoadedPeople, loaded: LoadedCamera) -> list[tuple[int, Keypoints]]:

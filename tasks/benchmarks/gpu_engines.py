@@ -6,16 +6,13 @@ from collections.abc import Callable
 from contextlib import nullcontext
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
 
-from larp_model import state as packed
 from larp_model.engines.mujoco import Truth, compile_model
-from larp_model.learned.model import initial_weights
+from larp_model.learned.model import untrained_weights
 from larp_model.learned.paper import PaperModel
-from larp_model.physics.kinematics import morphology_of
 from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 
@@ -74,11 +71,8 @@ def networks_of_paper(scene: Scene, precision: str | None = None) -> Callable[[A
 
     precision: of the products of matrices, such as "bfloat16", which a GPU multiplies faster; single by default.
     """
-    model, sizes = PaperModel(scene), morphology_of(scene)[None]
-    state = jnp.zeros((1, len(scene.links), packed.SIZE)).at[..., 3].set(1.0)
-    control, torque = jnp.zeros((1, len(scene.motors), 3)), jnp.zeros((1, len(scene.links), 3))
-    measured = model.measure(state, state, control, torque, jnp.asarray(sizes, jnp.float32))
-    simulator = Simulator.of(model, initial_weights(model, jax.random.key(0), measured))
+    model = PaperModel(scene)
+    simulator = Simulator.of(model, untrained_weights(model, jax.random.key(0)))
 
     def step(carry: Array, control: Array) -> Array:
         with jax.default_matmul_precision(precision) if precision else nullcontext():
