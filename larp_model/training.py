@@ -238,10 +238,19 @@ class TrainingLog:
 
     def __init__(self, folder: Path, first: int, batch: int) -> None:
         """Begin to log updates from number `first` on, of so many sequences each."""
-        self.content: dict[str, Any] = {"history": [], "dropped": 0, "stopped_early": False, "seconds": 0.0}
         self.folder, self.first, self.batch, self.begin = folder, first, batch, time.perf_counter()
+        seconds, dropped = self._before()
+        self.content: dict[str, Any] = {"history": [], "dropped": dropped, "stopped_early": False, "seconds": seconds}
+        self.seconds_before = seconds
         self.recent: list[dict[str, float]] = []
         self.dropped_in_a_row = 0
+
+    def _before(self) -> tuple[float, int]:
+        """Return the seconds and the dropped batches of the updates before the first, by the file."""
+        path = self.folder / "history.jsonl"
+        rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+        past = [row for row in rows if row["update"] == self.first]
+        return (past[-1]["seconds"], past[-1]["dropped_in_all"]) if past else (0.0, 0)
 
     def add(self, terms: dict[str, Array]) -> None:
         """Add the losses and norms of an update."""
@@ -255,7 +264,9 @@ class TrainingLog:
         finite = [row for row in self.recent if np.isfinite(row["loss"])] or self.recent
         mean = {name: float(np.mean([row[name] for row in finite])) for name in self.recent[-1]}
         rate = (updates - self.first) * self.batch / (now - self.begin)
-        row = {"update": updates, "unroll": unroll, **mean, "sequences_per_second": rate}
+        self.content["seconds"] = self.seconds_before + now - self.begin
+        totals = {"seconds": self.content["seconds"], "dropped_in_all": self.content["dropped"]}
+        row = {"update": updates, "unroll": unroll, **mean, "sequences_per_second": rate, **totals}
         self.content["history"].append(row)
         with (self.folder / "history.jsonl").open("a") as file:
             file.write(json.dumps(row) + "\n")
@@ -298,7 +309,7 @@ def train(
     with closing(manager), _progress_bar(quiet) as bar, SummaryWriter(board_folder) as board:
         task = bar.add_task("", total=recipe.updates, completed=first, note="")
         draw: Callable[[np.random.Generator, int], Batch | StepExamples] = windows.draw
-        if isinstance(model, ResidualModel):
+        if isinstance(model, ResidualModel) and index < recipe.updates:
             bar.update(task, note="physics of all steps, once")
             draw = partial(windows.draw_examples, table_of(model, windows.sources))
         while index < recipe.updates:
@@ -324,7 +335,6 @@ def train(
                 updates_left = (seconds - (now - log.begin)) / ((now - compiled) / (TIMED - 1))
                 recipe = replace(recipe, updates=min(recipe.updates, index + max(1, int(updates_left))))
                 bar.update(task, total=recipe.updates)
-    log.content["seconds"] = time.perf_counter() - log.begin
     return weights._replace(networks=networks), log.content
 
 

@@ -29,7 +29,7 @@ from larp_model.networks import Size, Weights
 from larp_model.scene import Scene
 from larp_model.step_examples import examples_of, table_of
 from larp_model.training import Batch, Recipe, Windows, statistics_of, train
-from tasks.curve import curve_picture
+from tasks.curve import curve_picture, history
 
 SWING = Scene((chain(links=2),))
 MODEL = PaperModel(SWING, Sizes(*[Size(2, 16)] * 3))  # which compiles soonest
@@ -142,8 +142,10 @@ def test_a_training_cut_off_goes_on_as_if_it_had_not_been(
     resumed, log = train(MODEL, SHORT, sources, tmp_path / "cut", quiet=True)
     assert [row["update"] for row in log["history"]] == [200], "the first hundred were not trained again"
     assert same(resumed, whole)
-    again, log = train(MODEL, SHORT, sources, tmp_path / "cut", quiet=True)
-    assert not log["history"] and same(again, whole)
+    again, totals = train(MODEL, SHORT, sources, tmp_path / "cut", quiet=True)
+    assert not totals["history"] and same(again, whole)
+    first, _ = history(tmp_path / "cut")
+    assert totals["seconds"] == log["seconds"] > first["seconds"] > 0.0, "of both parts"
 
 
 def measured(swings: Episodes) -> Weights:
