@@ -16,7 +16,7 @@ from larp_model.errors import InputError
 from larp_model.names import require_file, require_known
 from larp_model.scene import Scene
 from tasks.episodes.any_motion import any_episodes
-from tasks.episodes.around_kick import random_episodes
+from tasks.episodes.around_kick import STEPS, random_episodes
 from tasks.episodes.chains import thrown_episodes
 from tasks.motions import references
 from tasks.pose.joint_motion import source_of
@@ -29,13 +29,13 @@ WINDOWS, CHAIN_WINDOWS = (10, 38, 60), (10, 40, 80, 190)
 class Scenario:
     """Scene, how its ground-truth episodes are drawn, and the paper's errors there.
 
-    draw: returns episodes from (count, seed), and how many more were dropped. windows: the first n steps over which
-    errors are averaged. paper: mean position error [m] over the windows, by body.
+    draw: returns episodes from (count, seed), and how many more were dropped; of so many steps where `steps` is given.
+    windows: the first n steps over which errors are averaged. paper: mean position error [m] over the windows, by body.
     """
 
     name: str
     scene: Scene
-    draw: Callable[[int, int], tuple[Episodes, int]]
+    draw: Callable[..., tuple[Episodes, int]]
     windows: tuple[int, ...]
     paper: tuple[tuple[str, tuple[float, ...]], ...] = ()
 
@@ -49,12 +49,14 @@ def _embedded(scene: Scene) -> references.Reference:
     return references.embedded(_kicking(scene))
 
 
-def _around_the_kick(scene: Scene, count: int, seed: int, varied: bool = False) -> tuple[Episodes, int]:
-    return random_episodes(scene, _embedded(scene), count, seed, varied=varied)
+def _around_the_kick(
+    scene: Scene, count: int, seed: int, steps: int = STEPS, varied: bool = False
+) -> tuple[Episodes, int]:
+    return random_episodes(scene, _embedded(scene), count, seed, steps, varied)
 
 
-def _any_human(scene: Scene, count: int, seed: int) -> tuple[Episodes, int]:
-    return any_episodes(scene, _embedded(scene), count, seed)
+def _any_human(scene: Scene, count: int, seed: int, steps: int = STEPS) -> tuple[Episodes, int]:
+    return any_episodes(scene, _embedded(scene), count, seed, steps)
 
 
 def _human(name: str, scene: Scene, *paper: tuple[str, tuple[float, ...]]) -> Scenario:

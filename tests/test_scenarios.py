@@ -51,6 +51,12 @@ def test_episodes_are_sound_and_reach_the_longest_window(drawn: tuple[str, Episo
     assert episodes.states.shape[2] == len(SCENARIOS[name].scene.links)
 
 
+@pytest.mark.parametrize("name", ["chain4", "human_ball", "any_human_alone"])
+def test_episodes_are_as_long_as_is_asked_for(name: str) -> None:
+    episodes, _ = SCENARIOS[name].draw(4, 5, steps=320)  # longer than the reference kick
+    assert episodes.steps == 320 and len(episodes.states) >= 3
+
+
 def test_joints_hold_in_the_truth(drawn: tuple[str, Episodes]) -> None:
     scene = SCENARIOS[drawn[0]].scene
     apart = kinematics.displacement(scene, jnp.asarray(drawn[1].states), jnp.asarray(drawn[1].morphology[:, None]))

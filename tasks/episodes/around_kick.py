@@ -35,7 +35,7 @@ def random_starts(
     The link that the human may strike, if any, rests where a foot will pass or near the ball's spot, or comes from
     anywhere. sizes: (count, L, 3) of other bodies, placed as far above the ground as the reference is.
     """
-    latest_start = len(reference.controls) - steps - 1
+    latest_start = max(len(reference.controls) - steps - 1, 1)
     from_start = random.random(count) < 0.5
     first_steps = np.where(from_start, 0, random.integers(0, min(120, latest_start), count))
     rows = scene.rows("human")
@@ -61,7 +61,8 @@ def random_starts(
     for pair in scene.between.pairs:
         struck_link = scene.index(pair.second, pair.second_links[0])
         foot = scene.index("human", "right_foot")
-        paths = size_ratio * reference.states[first_steps[:, None] + np.arange(steps), foot, :3]
+        path_rows = np.minimum(first_steps[:, None] + np.arange(steps), len(reference.controls))
+        paths = size_ratio * reference.states[path_rows, foot, :3]
         spot = size_ratio[:, 0] * reference.ball_spot[:2]
         states[:, struck_link] = random_places(random, scene.links[struck_link], spot, paths, scene.dt)
         states = out_of_legs(scene, states, sizes)
