@@ -204,6 +204,8 @@ ORDER = [
     "tasks.benchmarks",
     "tasks.experiments.changes",
     "tasks.experiments.lists",
+    "tasks.experiments.tables",
+    "tasks.experiments.tracked",
     "tasks.experiments.speed",
     "tasks.experiments.runner",
     "tasks.experiments.__main__",

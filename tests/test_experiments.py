@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -19,12 +20,14 @@ from larp_model.errors import InputError
 from larp_model.learned.model import Model, initial_weights
 from larp_model.learned.paper import PaperModel, Sizes, Variant
 from larp_model.networks import Size
-from larp_model.simulator import step
+from larp_model.simulator import Simulator, step
 from tasks.benchmarks import engines, report
 from tasks.experiments import runner, speed
 from tasks.experiments.changes import CHANGES, DESIGNS
-from tasks.experiments.lists import EXPERIMENTS, Trial
-from tasks.experiments.runner import BudgetSpentError, TrialRunner, chosen_runs, only_one_in, picture, table_of
+from tasks.experiments.lists import EXPERIMENTS, UPDATES, Trial
+from tasks.experiments.runner import BudgetSpentError, TrialRunner, chosen_runs, only_one_in
+from tasks.experiments.tables import picture, tables_of
+from tasks.experiments.tracked import errors, tracked
 from tasks.scenarios import scenario
 
 LEAST = Sizes(*[Size(2, 16)] * 3)
@@ -139,28 +142,77 @@ def test_a_run_is_trained_once_and_judged_by_its_errors(tmp_path: Path, monkeypa
     row = trained()
     assert row["sequences"] == 8 and row["judged"] == 6 and 0.0 < row["windows"]["10"]["chain"] < 20.0
     again = trained()  # from the last checkpoint, which is that of all updates
-    assert again["windows"] == row["windows"] and again["seconds"] < row["seconds"]
-    with pytest.raises(InputError, match=r"updates is 4, but the run in .* was begun with 3"):
-        TrialRunner(experiment, TINY._replace(updates=4), tmp_path, "ablations", time.monotonic() + 600.0)()
+    assert again["windows"] == row["windows"] and again["seconds"] == row["seconds"]
     with pytest.raises(BudgetSpentError):
         TrialRunner(experiment, TINY, tmp_path, "ablations", time.monotonic() - 1.0)()
+    slower = DESIGNS["paper"]._replace(recipe=replace(DESIGNS["paper"].recipe, learning_rate=1e-4))
+    monkeypatch.setitem(DESIGNS, "paper", slower)
+    with pytest.raises(InputError, match=r"made by is .*learning_rate=0.0001.*was begun with .*learning_rate=0.001"):
+        trained()
+
+
+def test_the_human_of_a_simulator_stands_while_it_tracks_squats() -> None:
+    scores = tracked(Simulator.of_physics(scenario("any_human_alone").scene), (20, 60))
+    assert scores["windows"]["20"]["human"] < 0.03 and scores["windows"]["60"]["human"] < 0.03
+    assert scores["displacement_m"] < 1e-3 and scores["diverged"] == 0
+
+
+def test_windows_within_which_a_tracking_diverges_have_no_error() -> None:
+    scene = scenario("chain4").scene
+    states = np.zeros((30, 4, packed.SIZE), np.float32)
+    states[..., packed.ORIENTATION] = (1.0, 0.0, 0.0, 0.0)
+    moved = states + np.eye(packed.SIZE, dtype=np.float32)[0] * 0.1
+    scores = errors(scene, moved[:20], states, scene.morphology, (20, 30))
+    assert scores["windows"]["20"]["chain"] == pytest.approx(0.1) and scores["windows"]["30"]["chain"] is None
+    assert scores["diverged"] == 1 and scores["sequences"] == 1
+
+
+Errors = dict[str, dict[str, float | None]]
+
+
+def row_of(scene: str, change: str, seed: int, windows: Errors, **others: float) -> report.Row:
+    of_both = {"design": "paper", "sequences": 8, "updates": UPDATES, "displacement_m": 0.001, "judged": 4}
+    own = {"scene": scene, "change": change, "seed": seed, "windows": windows, "diverged": seed, "seconds": 60.0}
+    return of_both | own | others
 
 
 def test_tables_say_mean_and_spread_and_what_diverged() -> None:
     experiment = chosen_runs("ablations", ("chain4",), ("none", "12 layers"))._replace(windows=(10, 190))
     rows = [
-        {"scene": "chain4", "design": "paper", "change": change, "sequences": 8, "seed": seed, "seconds": 7.0,
-         "windows": {"10": {"chain": 0.01}, "190": {"chain": error}}, "displacement_m": 0.001, "diverged": seed,
-         "judged": 4}
+        row_of("chain4", change, seed, {"10": {"chain": 0.01}, "190": {"chain": error}})
         for change, errors in (("none", (0.2, 0.4)), ("12 layers", (0.3, None))) for seed, error in enumerate(errors)
     ]  # fmt: skip
-    table = table_of(experiment, rows)
+    (table,) = tables_of(experiment, rows)
     cells = [list(column.cells) for column in table.columns]
-    assert cells[0] == ["chain4, paper", "chain4, paper, 12 layers"]
+    assert cells[0] == ["paper", "paper, 12 layers"]
     assert cells[2] == ["0.300 ± 0.100", "diverged"] and cells[4] == ["12 %", "12 %"]
     assert cells[-1] == ["0.11 m", ""]
     (axes,) = picture(experiment, rows).axes
     assert [text.get_text() for text in axes.get_yticklabels()] == ["paper", "paper, 12 layers"]
+
+
+def test_a_scene_has_a_table_of_its_own_and_a_column_of_each_kind_of_body() -> None:
+    both: dict[str, float | None] = {"human": 0.1, "ball": 0.2}
+    rows = [
+        row_of("chains2", "none", 0, {str(n): {"first": 0.1, "second": 0.3} for n in (10, 40, 80, 190)}),
+        row_of("human_ball", "none", 0, {str(n): both for n in (10, 38, 60)}),
+    ]
+    chains, humans = tables_of(EXPERIMENTS["ablations"], rows)
+    assert [str(column.header) for column in chains.columns][1:5] == [f"{n} steps [m]" for n in (10, 40, 80, 190)]
+    assert [list(column.cells) for column in chains.columns][1] == ["0.200"]
+    by_title = {str(column.header): list(column.cells) for column in humans.columns}
+    assert by_title["human, 60 steps [m]"] == ["0.100"] and by_title["ball, 60 steps [m]"] == ["0.200"]
+
+
+def test_errors_are_drawn_over_data_and_over_minutes() -> None:
+    numbers = ((1000, UPDATES, 60.0, 0.4), (4000, UPDATES, 70.0, 0.3), (4000, 12000, 240.0, 0.2))
+    rows = [
+        row_of("chain4", "none", seed, {"190": {"chain": error}}, sequences=count, updates=updates, seconds=seconds)
+        for count, updates, seconds, error in numbers for seed in (0, 1)
+    ]  # fmt: skip
+    by_data, by_time = picture(EXPERIMENTS["data"]._replace(windows=(190,)), rows).axes
+    assert list(np.asarray(by_data.lines[0].get_xdata())) == [1000, 4000]
+    assert list(np.asarray(by_time.lines[0].get_xdata())) == pytest.approx([70.0 / 60.0, 4.0])
 
 
 def timed(engine: str, substeps: int, batch: int, ms: float | None) -> report.Row:

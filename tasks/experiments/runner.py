@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import fcntl
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import tyro
-from matplotlib.figure import Figure
 from rich.console import Console
-from rich.table import Table
 
 from larp_model import evaluation, training
 from larp_model.engines.episodes import Episodes
@@ -24,19 +22,16 @@ from larp_model.names import require_known
 from larp_model.simulator import Simulator
 from tasks.benchmarks import report
 from tasks.command import prepare_jax
-from tasks.episodes.chains import thrown_episodes
 from tasks.experiments import speed
 from tasks.experiments.changes import CHANGES, DESIGNS
 from tasks.experiments.lists import EXPERIMENTS, Experiment, Trial
+from tasks.experiments.tables import picture, tables_of, windows_of
+from tasks.experiments.tracked import tracked
 from tasks.scenarios import scenario
 from tasks.train import EVALUATION_SEED, claim, stored_episodes
 
 # Seed of all training data, and episodes by which runs are judged.
 DATA_SEED, JUDGED = 100, 256
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
-
-Key = tuple[str, str, str, int]
-"""Scene, design, change and sequences: those of several seeds have them in common."""
 
 
 class BudgetSpentError(Exception):
@@ -91,10 +86,11 @@ def main(
             return
         report.write_json(path, {"command": command, "hardware": report.hardware(), "rows": rows})
         report.write_picture(path.with_suffix(".png"), picture(experiment, rows))
-        table = table_of(experiment, rows)
-        report.show(table)
+        tables = tables_of(experiment, rows)
+        for table in tables:
+            report.show(table)
         if publish:
-            report.publish(f"experiment_{name}", experiment.title, command, table)
+            report.publish(f"experiment_{name}", experiment.title, command, *tables)
 
 
 def chosen_runs(
@@ -157,99 +153,30 @@ class TrialRunner:
         recipe = replace(change.recipe(design.recipe), updates=trial.updates, seed=trial.seed)
         folder.mkdir(parents=True, exist_ok=True)
         claim(folder, {**trial._asdict(), "made by": repr((model, recipe))})
-        episodes = self.episodes(trial.sequences, DATA_SEED, 200)
+        episodes = self.episodes(trial.sequences, DATA_SEED)
         weights, log = training.train(model, recipe, [(episodes, 1.0)], folder, quiet=True)
-        judged = self.episodes(JUDGED, EVALUATION_SEED, self.experiment.steps)
-        scores = evaluation.evaluate(Simulator.of(model, weights), judged, self.experiment.windows)
-        scores.pop("launch")
-        return {
-            **trial._asdict(),
-            "seconds": log["seconds"],
-            "dropped": log["dropped"],
-            **scores,
-            "sequences": trial.sequences,
-            "judged": scores["sequences"],
-        }
+        scores = self.scores(Simulator.of(model, weights))
+        totals = {"seconds": log["seconds"], "dropped": log["dropped"], "judged": scores.pop("sequences")}
+        return {**trial._asdict(), **totals, **scores}
 
-    def episodes(self, count: int, seed: int, steps: int) -> Episodes:
-        """Return ground-truth episodes of the run's scene, which are drawn once for all runs."""
+    def scores(self, simulator: Simulator) -> report.Row:
+        """Return the errors of a simulator; see `evaluation.evaluate` and `tracked.tracked`."""
+        experiment, windows = self.experiment, windows_of(self.experiment, self.trial.scene)
+        if experiment.tracked and simulator.scene.motors:
+            return tracked(simulator, windows)
+        judged = self.episodes(JUDGED, EVALUATION_SEED, max(windows) if experiment.windows else None)
+        scores = evaluation.evaluate(simulator, judged, windows)
+        scores.pop("launch")
+        return scores
+
+    def episodes(self, count: int, seed: int, steps: int | None = None) -> Episodes:
+        """Return ground-truth episodes of the run's scene, which are drawn once for all runs.
+
+        steps: as many as the scene's episodes usually have by default.
+        """
         chosen = scenario(self.trial.scene)
         folder = self.folder / "data"
         folder.mkdir(exist_ok=True)
-        path = folder / f"{self.trial.scene}_{count}_{steps}_seed_{seed}.npz"
-        return stored_episodes(
-            path,
-            chosen.scene,
-            lambda: thrown_episodes(chosen.scene, count, seed, steps, varied=True),
-            Console(stderr=True),
-        )
-
-
-def by_key(rows: Sequence[report.Row]) -> dict[Key, list[report.Row]]:
-    """Return the rows of several seeds by what they have in common."""
-    groups: dict[Key, list[report.Row]] = {}
-    for row in rows:
-        groups.setdefault((row["scene"], row["design"], row["change"], row["sequences"]), []).append(row)
-    return groups
-
-
-def errors_at(rows: Sequence[report.Row], window: int) -> np.ndarray:
-    """Return the mean position error [m] of all bodies in a window of each row, NaN where all predictions diverged."""
-    means = [[np.nan if error is None else error for error in row["windows"][str(window)].values()] for row in rows]
-    errors: np.ndarray = np.array(means, float).mean(axis=1)
-    return errors
-
-
-def with_spread(values: np.ndarray | Sequence[float | None], digits: int = 3) -> str:
-    """Return mean and standard deviation of values as text."""
-    known = np.array([np.nan if value is None else value for value in values], float)
-    if not np.isfinite(known).all():
-        return "diverged"
-    return f"{known.mean():.{digits}f} ± {known.std():.{digits}f}" if len(known) > 1 else f"{known.mean():.{digits}f}"
-
-
-def label_of(key: Key, groups: Collection[Key]) -> str:
-    """Return design and change of runs as text, and how many sequences they have where these differ."""
-    _, design, change, sequences = key
-    many = len({other[-1] for other in groups}) > 1
-    return ", ".join([design, *([] if change == "none" else [change]), *([f"{sequences} sequences"] if many else [])])
-
-
-def table_of(experiment: Experiment, rows: Sequence[report.Row]) -> Table:
-    """Return a table of all runs, mean and standard deviation over the seeds, beside what the paper says."""
-    groups = by_key(rows)
-    windows = (f"{window} steps [m]" for window in experiment.windows)
-    title = f"{experiment.title}: mean ± standard deviation of {len({row['seed'] for row in rows})} seeds"
-    table = Table("run", *windows, "joints apart [m]", "diverged", "training", "the paper", title=title)
-    for key, group in groups.items():
-        diverged = 100.0 * sum(row["diverged"] for row in group) / sum(row["judged"] for row in group)
-        table.add_row(
-            f"{key[0]}, {label_of(key, groups)}",
-            *(with_spread(errors_at(group, window)) for window in experiment.windows),
-            with_spread([row["displacement_m"] for row in group], 4), f"{diverged:.0f} %",
-            f"{np.mean([row['seconds'] for row in group]):.0f} s", experiment.paper.get(key[:3], ""),
-        )  # fmt: skip
-    return table
-
-
-def picture(experiment: Experiment, rows: Sequence[report.Row]) -> Figure:
-    """Plot the error of all runs of each scene in the longest window, a bar from the least to the largest seed."""
-    groups, window = by_key(rows), experiment.windows[-1]
-    scenes = [*dict.fromkeys(scene for scene, *_ in groups)]
-    heights = [sum(scene == key[0] for key in groups) for scene in scenes]
-    figure = Figure(figsize=(8, 1.2 + 0.32 * sum(heights) + 0.6 * len(scenes)), layout="constrained")
-    axes = figure.subplots(len(scenes), 1, squeeze=False, height_ratios=heights, sharex=True)[:, 0]
-    designs = [*dict.fromkeys(design for _, design, *_ in groups)]
-    for scene, axis in zip(scenes, axes, strict=True):
-        own = {key: errors_at(group, window) for key, group in groups.items() if key[0] == scene}
-        for place, ((_, design, *_), errors) in enumerate(own.items()):
-            if len(known := errors[np.isfinite(errors)]):
-                colour = COLOURS[designs.index(design)]
-                axis.plot([known.min(), known.max()], [place, place], color=colour, linewidth=3, alpha=0.5)
-                axis.plot(known.mean(), place, "o", color=colour)
-        axis.set_yticks(range(len(own)), [label_of(key, groups) for key in own])
-        axis.invert_yaxis()
-        axis.set(title=scene, xscale="log")
-        axis.grid(alpha=0.3, axis="x")
-    axes[-1].set_xlabel(f"mean position error over {window} steps [m]")
-    return figure
+        path = folder / f"{self.trial.scene}_{count}{f'_{steps}_steps' if steps else ''}_seed_{seed}.npz"
+        options = {"steps": steps} if steps else {}
+        return stored_episodes(path, chosen.scene, partial(chosen.draw, count, seed, **options), Console(stderr=True))
