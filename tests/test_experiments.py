@@ -125,6 +125,9 @@ def test_a_part_of_an_experiment_has_the_runs_that_are_asked_for() -> None:
     runs = chosen_runs("ablations", ("chain4",), ("none", "quaternions"), 2, 50).runs
     assert {run.scene for run in runs} == {"chain4"} and {run.change for run in runs} == {"none", "quaternions"}
     assert {run.seed for run in runs} == {0, 1} and {run.updates for run in runs} == {50}
+    assert len(runs) == len(set(runs)) == 6, "of the paper's design with both, and of ours as it is"
+    shorter = chosen_runs("data", (), (), 1, 50).runs
+    assert len({run.name for run in shorter}) == len(shorter) == 8, "runs that differ in updates alone are one"
 
 
 def test_a_second_run_in_a_folder_is_refused(tmp_path: Path) -> None:
@@ -185,7 +188,7 @@ def test_tables_say_mean_and_spread_and_what_diverged() -> None:
     (table,) = tables_of(experiment, rows)
     cells = [list(column.cells) for column in table.columns]
     assert cells[0] == ["paper", "paper, 12 layers"]
-    assert cells[2] == ["0.300 ± 0.100", "diverged"] and cells[4] == ["12 %", "12 %"]
+    assert cells[2] == ["0.3000 ± 0.1000", "diverged"] and cells[4] == ["12 %", "12 %"]
     assert cells[-1] == ["0.11 m", ""]
     (axes,) = picture(experiment, rows).axes
     assert [text.get_text() for text in axes.get_yticklabels()] == ["paper", "paper, 12 layers"]
@@ -199,9 +202,9 @@ def test_a_scene_has_a_table_of_its_own_and_a_column_of_each_kind_of_body() -> N
     ]
     chains, humans = tables_of(EXPERIMENTS["ablations"], rows)
     assert [str(column.header) for column in chains.columns][1:5] == [f"{n} steps [m]" for n in (10, 40, 80, 190)]
-    assert [list(column.cells) for column in chains.columns][1] == ["0.200"]
+    assert [list(column.cells) for column in chains.columns][1] == ["0.2000"]
     by_title = {str(column.header): list(column.cells) for column in humans.columns}
-    assert by_title["human, 60 steps [m]"] == ["0.100"] and by_title["ball, 60 steps [m]"] == ["0.200"]
+    assert by_title["human, 60 steps [m]"] == ["0.1000"] and by_title["ball, 60 steps [m]"] == ["0.2000"]
 
 
 def test_errors_are_drawn_over_data_and_over_minutes() -> None:
@@ -242,6 +245,13 @@ def test_without_mujoco_warp_its_row_says_so() -> None:
     assert (
         engines.answer(engines.Question("mjwarp", "ball", None, 20, 2))["refused"] == "is not installed (mujoco_warp)"
     )
+
+
+def test_options_of_another_experiment_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="seeds is 2, but speed has no seeds: leave it out"):
+        runner.main("speed", seeds=2, folder=tmp_path)
+    with pytest.raises(InputError, match="batch is 1,8, but data has no batch: leave it out"):
+        runner.main("data", batch="1,8", folder=tmp_path)
 
 
 def test_a_speed_of_no_batch_is_refused(tmp_path: Path) -> None:

@@ -27,6 +27,8 @@ RESULTS = Path("RESULTS.md")
 PICTURES = Path("docs")
 PROJECT = Path(__file__).parents[2]
 PACKAGES = ("larp_model", "mpc", "tasks")
+# Characters of a table's lines where no terminal shows them.
+FULL_WIDTH = 400
 
 Row = dict[str, Any]
 
@@ -163,5 +165,6 @@ def markdown(table: Table) -> str:
 
 
 def show(table: Table) -> None:
-    """Print a table."""
-    Console().print(table)
+    """Print a table; where it is read from a file or a pipe, in full width."""
+    width = None if Console().is_terminal else FULL_WIDTH
+    Console(width=width).print(table)

@@ -45,7 +45,7 @@ def main(
     seeds: int | None = None,
     updates: int | None = None,
     minutes: float = 170.0,
-    batch: str = speed.BATCHES,
+    batch: str | None = None,
     folder: Path = Path("runs/experiments"),
     publish: bool = False,
 ) -> None:
@@ -58,13 +58,18 @@ def main(
         seeds: only so many of each run.
         updates: of every run, instead of the experiment's own.
         minutes: after which no further run is begun.
-        batch: of speed, simulations side by side, with commas between them.
+        batch: of speed alone, simulations side by side, with commas between them; 1 to 32768 by default.
         folder: where runs keep their data, checkpoints and logs for TensorBoard.
         publish: put the table into RESULTS.md.
     """
     require_known("experiment", name, (*EXPERIMENTS, "speed"))
+    words = {"scenes": " ".join(scenes), "changes": " ".join(f"'{change}'" for change in changes), "seeds": seeds,
+             "updates": updates}  # fmt: skip
+    for option, value in (words if name == "speed" else {"batch": batch}).items():
+        if value:
+            raise InputError(f"{option} is {value}, but {name} has no {option}: leave it out")
     if name == "speed":
-        return speed.measure_speed(batch, folder, publish)
+        return speed.measure_speed(batch or speed.BATCHES, folder, publish)
     experiment = chosen_runs(name, scenes, changes, seeds, updates)
     if not minutes > 0.0:
         raise InputError(f"minutes is {minutes:g}, but must be above 0")
@@ -72,8 +77,6 @@ def main(
     report.ready(path, publish)
     require_writable(folder, "folder")
     prepare_jax()
-    words = {"scenes": " ".join(scenes), "changes": " ".join(f"'{change}'" for change in changes), "seeds": seeds,
-             "updates": updates}  # fmt: skip
     options = "".join(f" --{option} {value}" for option, value in words.items() if value)
     command = f"python -m tasks.experiments {name}{options}"
     deadline = time.monotonic() + 60.0 * minutes
@@ -116,7 +119,7 @@ def chosen_runs(
     ]
     if not runs:
         raise InputError(f"changes is {', '.join(changes)}, but {name} has no run with it in {', '.join(scenes)}")
-    return experiment._replace(runs=tuple(runs))
+    return experiment._replace(runs=tuple(dict.fromkeys(runs)))
 
 
 @contextmanager

@@ -62,8 +62,8 @@ def errors_at(rows: Sequence[Row], window: int, bodies: Collection[str] = ()) ->
     return errors
 
 
-def with_spread(values: np.ndarray | Sequence[float | None], digits: int = 3) -> str:
-    """Return mean and standard deviation of values as text."""
+def with_spread(values: np.ndarray | Sequence[float | None], digits: int = 4) -> str:
+    """Return mean and standard deviation of values [m] as text."""
     known = np.array([np.nan if value is None else value for value in values], float)
     if not np.isfinite(known).all():
         return "diverged"
@@ -88,14 +88,14 @@ def _table_of(experiment: Experiment, scene: str, groups: dict[Key, list[Row]]) 
     columns = [(bodies, window) for bodies in names.values() for window in windows]
     titles = [f"{bodies[0]}, {n} steps [m]" if len(names) > 1 else f"{n} steps [m]" for bodies, n in columns]
     seeds = len({row["seed"] for group in groups.values() for row in group})
-    title = f"{experiment.title}, {scene}: mean ± standard deviation of {seeds} seeds"
+    title = f"{experiment.title}, {scene}: mean ± standard deviation of {seeds} seed{'s' * (seeds > 1)}"
     table = Table("run", *titles, "joints apart [m]", "diverged", "training", "the paper", title=title)
     for key, group in groups.items():
         diverged = 100.0 * sum(row["diverged"] for row in group) / sum(row["judged"] for row in group)
         table.add_row(
             key.label(groups),
             *(with_spread(errors_at(group, window, bodies)) for bodies, window in columns),
-            with_spread([row["displacement_m"] for row in group], 4), f"{diverged:.0f} %",
+            with_spread([row["displacement_m"] for row in group]), f"{diverged:.0f} %",
             f"{np.mean([row['seconds'] for row in group]):.0f} s", experiment.paper.get(key[:3], ""),
         )  # fmt: skip
     return table
