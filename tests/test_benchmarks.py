@@ -91,6 +91,16 @@ def test_publishing_replaces_a_part_and_leaves_the_others(tmp_path: Path, monkey
     assert "| speed | 1 |" in text and not unsigned(text)
 
 
+def test_of_several_tables_each_has_its_title(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    report.RESULTS.write_text("# Results\n")
+    monkeypatch.setattr(report, "_git", lambda *arguments: "0123456789")
+    report.publish("both", "One", "python -m both", Table("a", title="One"), Table("b", title="Two"))
+    assert report.RESULTS.read_text().count("One") == 1 and "Two:\n\n| b |" in report.RESULTS.read_text()
+    report.publish("both", "Both", "python -m both", Table("a", title="One"), Table("b", title="Two"))
+    assert "## Both" in report.RESULTS.read_text() and "One:\n\n| a |" in report.RESULTS.read_text()
+
+
 def unsigned(results: str) -> list[str]:
     """Return the names of published tables that do not say at which commit, and of what, they are."""
     parts = re.findall(r"<!-- (\S+) -->\n(.*?)<!-- end of \1 -->", results, re.DOTALL)

@@ -139,11 +139,13 @@ def write_picture(path: Path, figure: Figure) -> None:
 def publish(name: str, title: str, command: str, *tables: Table) -> None:
     """Put a benchmark's tables into RESULTS.md, in place of its last ones, with the command above them.
 
-    Tables after the first have their titles above them.
+    Of several tables, each has its title above it where that is not the title of all.
     """
     begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
-    first, *others = map(markdown, tables)
-    texts = [first, *(f"{table.title}:\n\n{other}" for table, other in zip(tables[1:], others, strict=True))]
+    texts = [
+        text if len(tables) == 1 or table.title == title else f"{table.title}:\n\n{text}"
+        for table, text in zip(tables, map(markdown, tables), strict=True)
+    ]
     shown = "\n\n".join(texts)
     made_by = f"Measured on {hardware()}, at commit {_git('rev-parse', '--short=10', 'HEAD')}, with nothing learned."
     part = f"{begin}\n## {title}\n\n`{command}`\n\n{shown}\n\n{made_by}\n{end}"
