@@ -169,4 +169,4 @@ def markdown(table: Table) -> str:
 def show(table: Table) -> None:
     """Print a table; where it is read from a file or a pipe, in full width."""
     width = None if Console().is_terminal else FULL_WIDTH
-    Console(width=width).print(table)
+    Console(width=width, markup=False).print(table)  # [m] is a unit
