@@ -98,6 +98,10 @@ def test_a_process_that_dies_becomes_a_row_that_says_so(monkeypatch: pytest.Monk
     assert "code 1" in speed.QuestionRunner()(asked())["refused"]
 
 
+def test_a_process_is_ended_after_the_seconds_that_it_is_given() -> None:
+    assert speed.QuestionRunner({False: 1.0})(asked())["refused"] == "took longer than 1 s"
+
+
 @pytest.mark.parametrize("row", [{"refused": "needs more"}, {"refused": None, "ms_per_step": 1e4}])
 def test_what_an_engine_refused_or_is_slow_at_is_not_asked_again_with_a_larger_batch(
     row: report.Row, monkeypatch: pytest.MonkeyPatch

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json as codec
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
@@ -142,7 +142,9 @@ class QuestionRunner:
     Where an engine refused or was slow, later questions that differ only in the batch are not run.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, seconds: Mapping[bool, float] = SECONDS) -> None:
+        """seconds: time limit of a process [s]; see `SECONDS`."""
+        self.seconds = seconds
         self.refused: dict[Question, str] = {}
 
     def __call__(self, question: Question) -> report.Row:
@@ -158,7 +160,7 @@ class QuestionRunner:
     def ask(self, question: Question) -> report.Row:
         """Return the result of a question's process, or in `refused` the reason why there is none."""
         command = [sys.executable, "-m", "tasks.benchmarks.engines", codec.dumps(asdict(question))]
-        most = SECONDS[question.gradient]
+        most = self.seconds[question.gradient]
         try:
             done = subprocess.run(command, cwd=report.PROJECT, capture_output=True, text=True, timeout=most)
         except subprocess.TimeoutExpired:

@@ -16,6 +16,8 @@ BATCHES = "1,8,64,512,4096,32768"
 # Engines with their engine steps in a step of 10 ms.
 ENGINES = {"larp": 1, "networks": 1, "networks bfloat16": 1, "mjx": 20, "mjwarp": 20, "mujoco": 20}
 STEP = 0.01  # s
+# Time limit of an engine's process [s]: MuJoCo Warp compiles for minutes.
+MOST = 600.0
 # Milliseconds a step by batch in the paper: LARP, MJX and Brax on a V100, MuJoCo and Bullet on 48 cores.
 PAPER = {
     "LARP, the paper": {1: 0.07, 4096: 1.3},
@@ -33,7 +35,7 @@ def measure_speed(batch: str, folder: Path, publish: bool) -> None:
     sizes, path = batches(batch), folder / "speed.json"
     report.ready(path, publish)
     command = f"python -m tasks.experiments speed --batch {','.join(map(str, sizes))}"
-    ask = QuestionRunner()
+    ask = QuestionRunner({False: MOST})
     questions = [
         Question(engine, "human", None, substeps, size) for engine, substeps in ENGINES.items() for size in sizes
     ]
