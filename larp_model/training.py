@@ -6,7 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -34,6 +34,8 @@ from larp_model.step_examples import StepExamples, step_loss, table_of
 
 # Updates whose time tells how many fit into the time of a training.
 TIMED = 20
+# File of a run's folder with a row every hundred updates.
+HISTORY = "history.jsonl"
 
 
 @dataclass(frozen=True)
@@ -233,24 +235,31 @@ def update_of(model: Model, recipe: Recipe, weights: Weights) -> Update:
     return update
 
 
+def history(folder: Path) -> list[dict[str, Any]]:
+    """Return the rows that a training logged every hundred updates; of a repeated update, the last one.
+
+    A line that was cut off is left out.
+    """
+    path, rows = folder / HISTORY, list[dict[str, Any]]()
+    for line in path.read_text().splitlines() if path.is_file() else ():
+        with suppress(ValueError):
+            rows.append(json.loads(line))
+    return [row for _, row in sorted({row["update"]: row for row in rows}.items())]
+
+
 class TrainingLog:
     """Loss, norms and drops of a run: means of updates, for `train`'s log, a file and TensorBoard."""
 
     def __init__(self, folder: Path, first: int, batch: int) -> None:
         """Begin to log updates from number `first` on, of so many sequences each."""
         self.folder, self.first, self.batch, self.begin = folder, first, batch, time.perf_counter()
-        seconds, dropped = self._before()
-        self.content: dict[str, Any] = {"history": [], "dropped": dropped, "stopped_early": False, "seconds": seconds}
-        self.seconds_before = seconds
+        before = next((row for row in history(folder) if row["update"] == first), {})
+        self.seconds_before, dropped = before.get("seconds", 0.0), before.get("dropped_in_all", 0)
+        self.content: dict[str, Any] = {
+            "history": [], "dropped": dropped, "stopped_early": False, "seconds": self.seconds_before
+        }  # fmt: skip
         self.recent: list[dict[str, float]] = []
         self.dropped_in_a_row = 0
-
-    def _before(self) -> tuple[float, int]:
-        """Return the seconds and the dropped batches of the updates before the first, by the file."""
-        path = self.folder / "history.jsonl"
-        rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-        past = [row for row in rows if row["update"] == self.first]
-        return (past[-1]["seconds"], past[-1]["dropped_in_all"]) if past else (0.0, 0)
 
     def add(self, terms: dict[str, Array]) -> None:
         """Add the losses and norms of an update."""
@@ -268,7 +277,7 @@ class TrainingLog:
         totals = {"seconds": self.content["seconds"], "dropped_in_all": self.content["dropped"]}
         row = {"update": updates, "unroll": unroll, **mean, "sequences_per_second": rate, **totals}
         self.content["history"].append(row)
-        with (self.folder / "history.jsonl").open("a") as file:
+        with (self.folder / HISTORY).open("a") as file:
             file.write(json.dumps(row) + "\n")
         for name, value in row.items():
             board.add_scalar(name, value, updates)

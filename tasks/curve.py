@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,16 +10,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from larp_model.files import write_whole
+from larp_model.training import history
 
 DRAWN = ("loss", "position", "norm")
 COLOURS = ("#000000", "#0072B2", "#9aa3ad")
-
-
-def history(folder: Path) -> list[dict[str, float]]:
-    """Return the rows that a stage's training logged every hundred updates; of a repeated update, the last one."""
-    path = folder / "history.jsonl"
-    rows = [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
-    return [row for _, row in sorted({row["update"]: row for row in rows}.items())]
 
 
 def curve_picture(stages: Sequence[Path], path: Path) -> None:

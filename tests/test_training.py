@@ -28,8 +28,8 @@ from larp_model.learned.residual import ResidualModel
 from larp_model.networks import Size, Weights
 from larp_model.scene import Scene
 from larp_model.step_examples import examples_of, table_of
-from larp_model.training import Batch, Recipe, Windows, statistics_of, train
-from tasks.curve import curve_picture, history
+from larp_model.training import HISTORY, Batch, Recipe, Windows, history, statistics_of, train
+from tasks.curve import curve_picture
 
 SWING = Scene((chain(links=2),))
 MODEL = PaperModel(SWING, Sizes(*[Size(2, 16)] * 3))  # which compiles soonest
@@ -142,6 +142,8 @@ def test_a_training_cut_off_goes_on_as_if_it_had_not_been(
     resumed, log = train(MODEL, SHORT, sources, tmp_path / "cut", quiet=True)
     assert [row["update"] for row in log["history"]] == [200], "the first hundred were not trained again"
     assert same(resumed, whole)
+    with (tmp_path / "cut" / HISTORY).open("a") as file:
+        file.write('{"update": 300, "lo')  # as by a process that was ended while it wrote
     again, totals = train(MODEL, SHORT, sources, tmp_path / "cut", quiet=True)
     assert not totals["history"] and same(again, whole)
     first, _ = history(tmp_path / "cut")
