@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 from rich.table import Table
 
 from tasks.benchmarks.report import Row
@@ -149,6 +150,10 @@ def _curves(experiment: Experiment, groups: dict[Key, list[Row]]) -> Figure:
         axes.set(xscale="log", yscale="log")
         axes.grid(alpha=0.3)
         axes.legend(frameon=False)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if axes is by_time else (1,)))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter("{x:g}")
     return figure
 
 
