@@ -124,10 +124,10 @@ def test_runs_that_do_not_exist_are_refused_with_the_nearest_names(arguments: tu
 def test_a_part_of_an_experiment_has_the_runs_that_are_asked_for() -> None:
     runs = chosen_runs("ablations", ("chain4",), ("none", "quaternions"), 2, 50).runs
     assert {run.scene for run in runs} == {"chain4"} and {run.change for run in runs} == {"none", "quaternions"}
-    assert {run.seed for run in runs} == {0, 1} and {run.updates for run in runs} == {50}
-    assert len(runs) == len(set(runs)) == 6, "of the paper's design with both, and of ours as it is"
+    assert {run.seed for run in runs} == {0, 1} and {run.updates for run in runs if run.design != "physics"} == {50}
+    assert len(runs) == len(set(runs)) == 7, "of the paper's design with both, of ours as it is, and of physics"
     shorter = chosen_runs("data", (), (), 1, 50).runs
-    assert len({run.name for run in shorter}) == len(shorter) == 8, "runs that differ in updates alone are one"
+    assert len({run.name for run in shorter}) == len(shorter) == 9, "runs that differ in updates alone are one"
 
 
 def test_a_second_run_in_a_folder_is_refused(tmp_path: Path) -> None:
@@ -152,6 +152,14 @@ def test_a_run_is_trained_once_and_judged_by_its_errors(tmp_path: Path, monkeypa
     monkeypatch.setitem(DESIGNS, "paper", slower)
     with pytest.raises(InputError, match=r"made by is .*learning_rate=0.0001.*was begun with .*learning_rate=0.001"):
         trained()
+
+
+def test_physics_alone_is_judged_without_a_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runner, "JUDGED", 6)
+    experiment = chosen_runs("data")._replace(windows=(10, 40))
+    row = TrialRunner(experiment, experiment.runs[-1], tmp_path, "data", time.monotonic() + 600.0)()
+    assert row["design"] == "physics" and row["windows"]["40"]["chain"] < 0.01 and row["seconds"] == 0.0
+    assert not (tmp_path / "data" / experiment.runs[-1].name).exists()
 
 
 def test_the_human_of_a_simulator_stands_while_it_tracks_squats() -> None:
@@ -213,8 +221,10 @@ def test_errors_are_drawn_over_data_and_over_minutes() -> None:
         row_of("chain4", "none", seed, {"190": {"chain": error}}, sequences=count, updates=updates, seconds=seconds)
         for count, updates, seconds, error in numbers for seed in (0, 1)
     ]  # fmt: skip
+    rows.append(row_of("chain4", "none", 0, {"190": {"chain": 0.1}}, sequences=0, updates=0) | {"design": "physics"})
     by_data, by_time = picture(EXPERIMENTS["data"]._replace(windows=(190,)), rows).axes
     assert list(np.asarray(by_data.lines[0].get_xdata())) == [1000, 4000]
+    assert "physics alone" in by_data.get_legend_handles_labels()[1]
     assert list(np.asarray(by_time.lines[0].get_xdata())) == pytest.approx([70.0 / 60.0, 4.0])
 
 

@@ -60,6 +60,7 @@ DESIGNS = {
         replace(OF_NETWORKS, curriculum=((2, 0.2), (8, 0.8)), loss=OF_NETWORKS.loss._replace(displacement=0.0)),
     ),
     "residual": Design(_residual, replace(OVER_PHYSICS, batch=256)),
+    "physics": Design(ResidualModel, OVER_PHYSICS),  # without networks: nothing is trained
 }
 
 

@@ -8,7 +8,10 @@ from tasks.experiments.changes import CHANGES
 
 
 class Trial(NamedTuple):
-    """A training: the scene, the design and its change, sequences of the ground truth, seed, and updates."""
+    """A training: the scene, the design and its change, sequences of the ground truth, seed, and updates.
+
+    Physics without networks has no sequences and no updates.
+    """
 
     scene: str
     design: str
@@ -56,6 +59,10 @@ def _runs(
     return tuple(Trial(scene, design, change, sequences, seed, updates) for change in changes for seed in SEEDS)
 
 
+def _physics(scene: str) -> Trial:
+    return Trial(scene, "physics", "none", 0, 0, 0)
+
+
 EXPERIMENTS = {
     "ablations": Experiment(
         "Ablations",
@@ -66,6 +73,7 @@ EXPERIMENTS = {
             *_runs("chains2", "residual", OF_PHYSICS),
             *_runs("human_ball", "paper", ("none", *OF_BOTH)),
             *_runs("human_ball", "residual", OF_PHYSICS),
+            *(_physics(scene) for scene in ("chain4", "chains2", "human_ball")),
         ),
         {
             ("chain4", "paper", "none"): "0.11 m",
@@ -84,6 +92,7 @@ EXPERIMENTS = {
             *(run for updates in (750, 12000) for run in _runs("chain4", "paper", sequences=16000, updates=updates)),
             *(run for count in (250, 1000, 4000, 16000) for run in _runs("chain4", "residual", sequences=count)),
             *(run for updates in (750, 12000) for run in _runs("chain4", "residual", sequences=16000, updates=updates)),
+            _physics("chain4"),
         ),
         {},
     ),
@@ -92,8 +101,8 @@ EXPERIMENTS = {
         tuple(
             run
             for scene in ("chain4", "any_human_alone")
-            for design in ("paper", "supertrack", "residual")
-            for run in _runs(scene, design)
+            for runs in (*(_runs(scene, design) for design in ("paper", "supertrack", "residual")), [_physics(scene)])
+            for run in runs
         ),
         {("any_human_alone", "paper", "none"): "joints 0.02 m apart after 1500 steps"},
         (20, 190, 500, 1500),

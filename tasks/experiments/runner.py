@@ -19,6 +19,7 @@ from larp_model.engines.episodes import Episodes
 from larp_model.errors import InputError
 from larp_model.files import require_writable
 from larp_model.names import require_known
+from larp_model.networks import Weights
 from larp_model.simulator import Simulator
 from tasks.benchmarks import report
 from tasks.command import prepare_jax
@@ -111,7 +112,7 @@ def chosen_runs(
         if value is not None and value < 1:
             raise InputError(f"{argument} is {value}, but must be at least 1")
     runs = [
-        run._replace(updates=updates or run.updates)
+        run._replace(updates=updates) if updates and run.updates else run
         for run in experiment.runs
         if (not scenes or run.scene in scenes)
         and (not changes or run.change in changes)
@@ -153,11 +154,13 @@ class TrialRunner:
         trial, chosen, design = self.trial, scenario(self.trial.scene), DESIGNS[self.trial.design]
         change, folder = CHANGES[trial.change], self.folder / self.name / self.trial.name
         model = change.model(design.model(chosen.scene))
-        recipe = replace(change.recipe(design.recipe), updates=trial.updates, seed=trial.seed)
-        folder.mkdir(parents=True, exist_ok=True)
-        claim(folder, {**trial._asdict(), "made by": repr((model, recipe))})
-        episodes = self.episodes(trial.sequences, DATA_SEED)
-        weights, log = training.train(model, recipe, [(episodes, 1.0)], folder, quiet=True)
+        weights, log = Weights({}, {}, {}), {"seconds": 0.0, "dropped": 0}
+        if trial.updates:
+            recipe = replace(change.recipe(design.recipe), updates=trial.updates, seed=trial.seed)
+            folder.mkdir(parents=True, exist_ok=True)
+            claim(folder, {**trial._asdict(), "made by": repr((model, recipe))})
+            episodes = self.episodes(trial.sequences, DATA_SEED)
+            weights, log = training.train(model, recipe, [(episodes, 1.0)], folder, quiet=True)
         scores = self.scores(Simulator.of(model, weights))
         totals = {"seconds": log["seconds"], "dropped": log["dropped"], "judged": scores.pop("sequences")}
         return {**trial._asdict(), **totals, **scores}

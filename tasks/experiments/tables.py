@@ -31,7 +31,7 @@ class Key(NamedTuple):
         """Return design and change as text, and the numbers of sequences and updates where those of groups differ."""
         words = [self.design, *([] if self.change == "none" else [self.change])]
         for number in ("sequences", "updates"):
-            if len({getattr(other, number) for other in groups}) > 1:
+            if self.updates and len({getattr(other, number) for other in groups if other.updates}) > 1:
                 words.append(f"{getattr(self, number)} {number}")
         return ", ".join(words)
 
@@ -137,6 +137,11 @@ def _curves(experiment: Experiment, groups: dict[Key, list[Row]]) -> Figure:
     window = max(windows_of(experiment, next(iter(groups)).scene))
     for colour, design in zip(COLOURS, dict.fromkeys(key.design for key in groups), strict=False):
         own = {key: group for key, group in groups.items() if key.design == design}
+        if not any(key.updates for key in own):
+            (error,) = errors_at([row for group in own.values() for row in group], window)
+            for axes in (by_data, by_time):
+                axes.axhline(error, color=colour, linestyle="--", label=f"{design} alone")
+            continue
         same_updates = {key.sequences: group for key, group in own.items() if key.updates == UPDATES}
         _curve(by_data, same_updates, window, colour, design)
         counts = [key.sequences for key in own]
