@@ -215,6 +215,13 @@ def test_a_scene_has_a_table_of_its_own_and_a_column_of_each_kind_of_body() -> N
     assert by_title["human, 60 steps [m]"] == ["0.1000"] and by_title["ball, 60 steps [m]"] == ["0.2000"]
 
 
+def test_physics_alone_is_drawn_among_runs_of_one_number_of_sequences() -> None:
+    alone = row_of("chain4", "none", 0, {"190": {"chain": 0.1}}, sequences=0, updates=0) | {"design": "physics"}
+    rows = [*(row_of("chain4", "none", seed, {"190": {"chain": 0.3}}) for seed in (0, 1)), alone]
+    (axes,) = picture(EXPERIMENTS["ablations"], rows).axes
+    assert [text.get_text() for text in axes.get_yticklabels()] == ["paper", "physics"]
+
+
 def test_errors_are_drawn_over_data_and_over_minutes() -> None:
     numbers = ((1000, UPDATES, 60.0, 0.4), (4000, UPDATES, 70.0, 0.3), (4000, 12000, 240.0, 0.2))
     rows = [

@@ -105,7 +105,8 @@ def _table_of(experiment: Experiment, scene: str, groups: dict[Key, list[Row]]) 
 def picture(experiment: Experiment, rows: Sequence[Row]) -> Figure:
     """Plot the errors of all runs, and over data and minutes where these differ."""
     groups = by_key(rows)
-    return _curves(experiment, groups) if len({key.sequences for key in groups}) > 1 else _dots(experiment, groups)
+    counts = {key.sequences for key in groups if key.updates}
+    return _curves(experiment, groups) if len(counts) > 1 else _dots(experiment, groups)
 
 
 def _dots(experiment: Experiment, groups: dict[Key, list[Row]]) -> Figure:
