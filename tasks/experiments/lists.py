@@ -48,8 +48,8 @@ class Experiment(NamedTuple):
 SEQUENCES, SEEDS, UPDATES = 2000, (0, 1, 2), 3000
 OF_CONTACT = ("no stop-gradient", "contact impulse", "no contact network")
 OF_DYNAMICS = tuple(name for name in CHANGES if name not in OF_CONTACT)
-# Those of a human, whose networks take longest.
-OF_BOTH = ("unroll of 2 steps", "no displacement, input nor loss", "accelerations", *OF_CONTACT)
+# Those that are made with a human, too, whose networks take longest.
+OF_HUMAN = ("unroll of 2 steps", "no displacement, input nor loss", "accelerations", *OF_CONTACT)
 OF_PHYSICS = ("none", "3 layers")
 
 
@@ -59,8 +59,8 @@ def _runs(
     return tuple(Trial(scene, design, change, sequences, seed, updates) for change in changes for seed in SEEDS)
 
 
-def _physics(scene: str) -> Trial:
-    return Trial(scene, "physics", "none", 0, 0, 0)
+def _physics(*scenes: str) -> tuple[Trial, ...]:
+    return tuple(Trial(scene, "physics", "none", 0, 0, 0) for scene in scenes)
 
 
 EXPERIMENTS = {
@@ -71,9 +71,9 @@ EXPERIMENTS = {
             *_runs("chains2", "paper", ("none", *OF_CONTACT)),
             *_runs("chain4", "residual", OF_PHYSICS),
             *_runs("chains2", "residual", OF_PHYSICS),
-            *_runs("human_ball", "paper", ("none", *OF_BOTH)),
+            *_runs("human_ball", "paper", ("none", *OF_HUMAN)),
             *_runs("human_ball", "residual", OF_PHYSICS),
-            *(_physics(scene) for scene in ("chain4", "chains2", "human_ball")),
+            *_physics("chain4", "chains2", "human_ball"),
         ),
         {
             ("chain4", "paper", "none"): "0.11 m",
@@ -92,17 +92,16 @@ EXPERIMENTS = {
             *(run for updates in (750, 12000) for run in _runs("chain4", "paper", sequences=16000, updates=updates)),
             *(run for count in (250, 1000, 4000, 16000) for run in _runs("chain4", "residual", sequences=count)),
             *(run for updates in (750, 12000) for run in _runs("chain4", "residual", sequences=16000, updates=updates)),
-            _physics("chain4"),
+            *_physics("chain4"),
         ),
         {},
     ),
     "supertrack": Experiment(
         "Long sequences",
-        tuple(
-            run
-            for scene in ("chain4", "any_human_alone")
-            for runs in (*(_runs(scene, design) for design in ("paper", "supertrack", "residual")), [_physics(scene)])
-            for run in runs
+        (
+            *(run for design in ("paper", "supertrack", "residual") for run in _runs("chain4", design)),
+            *(run for design in ("paper", "supertrack", "residual") for run in _runs("any_human_alone", design)),
+            *_physics("chain4", "any_human_alone"),
         ),
         {("any_human_alone", "paper", "none"): "joints 0.02 m apart after 1500 steps"},
         (20, 190, 500, 1500),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from statistics import mode
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from rich.table import Table
 
 from tasks.benchmarks.report import Row
-from tasks.experiments.lists import UPDATES, Experiment
+from tasks.experiments.lists import Experiment
 from tasks.scenarios import scenario
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
@@ -132,7 +133,7 @@ def _dots(experiment: Experiment, groups: dict[Key, list[Row]]) -> Figure:
 
 
 def _curves(experiment: Experiment, groups: dict[Key, list[Row]]) -> Figure:
-    """Plot the error in the longest window over sequences, and over minutes of as many as most runs have."""
+    """Plot the error in the longest window over sequences and over minutes, the others as most runs have them."""
     figure = Figure(figsize=(9, 4), layout="constrained")
     by_data, by_time = figure.subplots(1, 2, sharey=True)
     window = max(windows_of(experiment, next(iter(groups)).scene))
@@ -143,14 +144,13 @@ def _curves(experiment: Experiment, groups: dict[Key, list[Row]]) -> Figure:
             for axes in (by_data, by_time):
                 axes.axhline(error, color=colour, linestyle="--", label=f"{design} alone")
             continue
-        same_updates = {key.sequences: group for key, group in own.items() if key.updates == UPDATES}
-        _curve(by_data, same_updates, window, colour, design)
-        counts = [key.sequences for key in own]
-        most = max(counts, key=counts.count)
+        updates, sequences = mode([key.updates for key in own]), mode([key.sequences for key in own])
+        same_updates = {key.sequences: group for key, group in own.items() if key.updates == updates}
+        _curve(by_data, same_updates, window, colour, f"{design}, {updates} updates")
         minutes = {np.mean([row["seconds"] for row in group]) / 60.0: group
-                   for key, group in own.items() if key.sequences == most}  # fmt: skip
-        _curve(by_time, minutes, window, colour, f"{design}, {most} sequences")
-    by_data.set(xlabel=f"sequences, {UPDATES} updates", ylabel=f"mean position error over {window} steps [m]")
+                   for key, group in own.items() if key.sequences == sequences}  # fmt: skip
+        _curve(by_time, minutes, window, colour, f"{design}, {sequences} sequences")
+    by_data.set(xlabel="sequences", ylabel=f"mean position error over {window} steps [m]")
     by_time.set(xlabel="minutes of training")
     for axes in (by_data, by_time):
         axes.set(xscale="log", yscale="log")
