@@ -17,6 +17,7 @@ from larp_model import rotation
 from larp_model import state as packed
 from larp_model.engines.episodes import Episodes
 from larp_model.errors import InputError
+from larp_model.evaluation import DIVERGED, evaluate
 from larp_model.learned.model import Model, initial_weights
 from larp_model.learned.paper import PaperModel, Sizes, Variant
 from larp_model.networks import Size
@@ -168,6 +169,15 @@ def test_the_human_of_a_simulator_stands_while_it_tracks_squats() -> None:
     assert scores["displacement_m"] < 1e-3 and scores["diverged"] == 0
 
 
+def test_where_all_predictions_diverge_there_is_no_error(thrown: dict[str, Episodes]) -> None:
+    given = thrown["chain4"]
+    elsewhere = given.states + 2.0 * DIVERGED * (np.arange(given.steps + 1) > 0)[:, None, None]
+    simulator = Simulator.of_physics(scenario("chain4").scene)
+    scores = evaluate(simulator, given._replace(states=elsewhere), (10,))
+    assert scores["diverged"] == scores["sequences"] == len(given.states)
+    assert scores["windows"]["10"]["chain"] is scores["displacement_m"] is scores["rotation_rad"]["chain"] is None
+
+
 def test_windows_within_which_a_tracking_diverges_have_no_error() -> None:
     scene = scenario("chain4").scene
     states = np.zeros((30, 4, packed.SIZE), np.float32)
@@ -176,6 +186,8 @@ def test_windows_within_which_a_tracking_diverges_have_no_error() -> None:
     scores = errors(scene, moved[:20], states, scene.morphology, (20, 30))
     assert scores["windows"]["20"]["chain"] == pytest.approx(0.1) and scores["windows"]["30"]["chain"] is None
     assert scores["diverged"] == 1 and scores["sequences"] == 1
+    at_once = errors(scene, moved[:0], states, scene.morphology, (20, 30))
+    assert at_once["displacement_m"] is None and at_once["windows"]["20"]["chain"] is None
 
 
 Errors = dict[str, dict[str, float | None]]
@@ -233,6 +245,9 @@ def test_errors_are_drawn_over_data_and_over_minutes() -> None:
     assert list(np.asarray(by_data.lines[0].get_xdata())) == [1000, 4000]
     assert "physics alone" in by_data.get_legend_handles_labels()[1]
     assert list(np.asarray(by_time.lines[0].get_xdata())) == pytest.approx([70.0 / 60.0, 4.0])
+    shorter = [row | {"updates": 50} for row in rows if row["updates"] == UPDATES]
+    by_data, _ = picture(EXPERIMENTS["data"]._replace(windows=(190,)), shorter).axes
+    assert list(np.asarray(by_data.lines[0].get_xdata())) == [1000, 4000], "whatever --updates is"
 
 
 def timed(engine: str, substeps: int, batch: int, ms: float | None) -> report.Row:

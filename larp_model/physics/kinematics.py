@@ -5,6 +5,7 @@ World frame; arrays have the batch last, as in `linalg`. A step computes them on
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -105,9 +106,10 @@ def local_anchors(scene: Scene, links: np.ndarray, points: list[Vector], sizes: 
 def displacement(scene: Scene, state: Array, morphology: Array) -> Array:
     """Return joint displacements (*, J, 3) [m] of states (*, L, 13) and morphologies (*, L, 3): see `Kinematics`."""
     sizes = jnp.broadcast_to(jnp.asarray(morphology), (*state.shape[:-1], 3))
-    flat = (array.reshape(-1, *array.shape[-2:]) for array in (state, sizes))
-    links = kinematics(scene, *(jnp.moveaxis(array, 0, -1) for array in flat))
-    return jnp.moveaxis(links.displacement, -1, 0).reshape(*state.shape[:-2], -1, 3)
+    count = math.prod(state.shape[:-2])  # which may be 0
+    flat = (array.reshape(count, *array.shape[-2:]) for array in (state, sizes))
+    apart = kinematics(scene, *(jnp.moveaxis(array, 0, -1) for array in flat)).displacement
+    return jnp.moveaxis(apart, -1, 0).reshape(*state.shape[:-2], *apart.shape[:-1])
 
 
 def morphology_of(scene: Scene) -> Array:

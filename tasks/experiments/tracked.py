@@ -79,13 +79,13 @@ def tracked(simulator: Simulator, windows: Sequence[int]) -> dict[str, Any]:
         tracker.follow(target_states[0], 0, steps, world)
     except DivergenceError:
         pass  # the states so far are those of the world
-    return errors(scene, np.stack(world.states[1:]), target_states, np.asarray(simulator.morphology), windows)
+    return errors(scene, np.array(world.states)[1:], target_states, np.asarray(simulator.morphology), windows)
 
 
 def errors(
     scene: Scene, states: np.ndarray, target_states: np.ndarray, morphology: np.ndarray, windows: Sequence[int]
 ) -> dict[str, Any]:
-    """Return what `tracked` does, of states (T, L, 13) beside those of the motion; T is less if they diverged."""
+    """Return what `tracked` does, of states (T, L, 13) beside those of the motion; T is less or 0 if they diverged."""
     steps = len(states)
     distance = np.linalg.norm((states - target_states[:steps])[..., packed.POSITION], axis=-1)
     known, lost = [n for n in windows if n <= steps], [n for n in windows if n > steps]
