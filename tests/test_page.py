@@ -143,6 +143,22 @@ def kick_button(seen: Page) -> Locator:
     return seen.get_by_role("button", name="Kick", exact=True)
 
 
+@pytest.fixture(autouse=True)
+def settings_are_left_as_found(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Set the controls back where a test failed half-way, and say what the page said: others go on from there."""
+    if "served" not in request.fixturenames:
+        yield
+        return
+    page: LivePage = request.getfixturevalue("served").page
+    controls = page.panel._controls.values()
+    before = [control.value for control in controls]
+    yield
+    print(page.settings, page.panel._text.content, sep="\n")
+    for control, value in zip(controls, before, strict=True):
+        if control.value != value:
+            control.value = value
+
+
 @pytest.fixture
 def played(seen: Page, served: Served) -> Page:
     """The page, on which a kick is played."""
@@ -333,14 +349,18 @@ def test_the_next_plan_tries_as_much_as_fits_into_the_seconds_that_are_set(seen:
 
 
 def choose(seen: Page, label: str, value: str) -> None:
-    """Choose from a list, which is clicked again where the page closed it, as it does when settings arrive late."""
-    option = seen.get_by_role("option", name=value, exact=True)
-    for _ in range(4):
-        beside(seen, label).first.click()
-        with suppress(AssertionError):
-            until(option.is_visible, 15.0)
-            break
-    option.click()
+    """Choose from a list, again and again: the page closes it, or loses the choice, where settings arrive late."""
+    control, option = beside(seen, label).first, seen.get_by_role("option", name=value, exact=True)
+
+    def chosen() -> bool:
+        if control.input_value() != value:
+            if not option.is_visible():
+                control.click()
+            with suppress(playwright.TimeoutError):
+                option.click(timeout=5_000)
+        return control.input_value() == value
+
+    until(chosen)
 
 
 def test_time_stands_still_goes_step_by_step_and_goes_on(played: Page, served: Served) -> None:
