@@ -189,6 +189,17 @@ def advanced(dynamics: Dynamics, states: jax.Array, controls: jax.Array) -> jax.
     return following
 
 
+def linearized(
+    dynamics: Dynamics, states: jax.Array, controls: jax.Array, count: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Return A and B of `Linearizable.linearize`; from step number `count` () on, those of states that stay."""
+    steps = of_steps(dynamics)
+    assert isinstance(steps, Linearizable)
+    by_state, by_control = steps.linearize(states, controls)
+    computed = (jnp.arange(len(controls)) < count)[:, None, None]
+    return jnp.where(computed, by_state, jnp.eye(by_state.shape[1])), jnp.where(computed, by_control, 0.0)
+
+
 def continued(dynamics: Dynamics, states: jax.Array) -> jax.Array:
     """Return the states (N, H', L, 13) of a rollout from those of its H steps under control, (N, H, L, 13)."""
     return dynamics.continued(states) if isinstance(dynamics, Continued) else states

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mpc.dynamics import Linearizable
+from mpc.dynamics import Coordinated, Linearizable
 
 # No joint target is changed by more about an axis [rad]: beyond, derivatives do not hold.
 LARGEST_CHANGE = 0.2
@@ -117,22 +117,21 @@ def finite_part(states: np.ndarray) -> np.ndarray:
     return states[: max(1, int(finite.sum()))]
 
 
-def linear_quadratic(
-    dynamics: Linearizable,
+def quadratic_costs(
+    dynamics: Coordinated,
     residuals_of: ResidualFunction,
     curvatures: dict[str, jax.Array],
     states: jax.Array,
     controls: jax.Array,
-) -> LinearQuadratic:
-    """Return the module's problem around states (H + 1, L, 13), the start first, and controls (H, J, 3) [rad].
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Return the module's W, G, E and diagonal of C around states (H, L, 13) after the steps, controls (H, J, 3) [rad].
 
     residuals_of: of a candidate; those of shape (H, R) depend, in each row, on the state after that step and on its
     control alone, as costs averaged over the steps do. curvatures: of the residuals, see `cost.curvatures`.
     """
-    horizon, after = len(controls), states[1:]
-    by_state, by_control = dynamics.linearize(states[:-1], controls)
-    basis = dynamics.basis(after)
-    count, inputs = by_control.shape[1:]
+    horizon, inputs = len(controls), controls[0].size
+    basis = dynamics.basis(states)
+    count = basis.shape[-1]
     names = {True: list[str](), False: list[str]()}
     for name, values in curvatures.items():
         names[values.ndim == 2 and len(values) == horizon].append(name)
@@ -149,15 +148,13 @@ def linear_quadratic(
         """Return the derivative (H, R) along the same direction (n + m,) in all steps."""
         control_change = jnp.broadcast_to(direction[count:].reshape(controls.shape[1:]), controls.shape)
         changes = basis @ direction[:count], control_change
-        slope: jax.Array = jax.jvp(lambda *steps: by_step(residuals_of(*steps)), (after, controls), changes)[1]
+        slope: jax.Array = jax.jvp(lambda *steps: by_step(residuals_of(*steps)), (states, controls), changes)[1]
         return slope
 
     slopes = jax.vmap(step_slope, out_axes=-1)(jnp.eye(count + inputs))
     sum_slopes = jax.jacrev(lambda *steps: in_sums(residuals_of(*steps)), (0, 1))
-    sum_by_states, sum_by_controls = sum_slopes(after, controls)
-    return LinearQuadratic(
-        by_state,
-        by_control,
+    sum_by_states, sum_by_controls = sum_slopes(states, controls)
+    return (
         jnp.einsum("hr,hri,hrj->hij", by_step(curvatures), slopes, slopes),
         jnp.einsum("rhlc,hlcn->hrn", sum_by_states, basis),
         jnp.moveaxis(sum_by_controls.reshape(-1, horizon, inputs), 0, 1),

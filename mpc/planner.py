@@ -17,7 +17,7 @@ from larp_model.errors import InputError
 from larp_model.runtime import one_blas_thread, prepare_compiler
 from mpc.batch import SharedRollouts
 from mpc.cost import CostTerm, require_weight
-from mpc.dynamics import Dynamics, Linearizable, advanced, expected_errors, of_steps, program_of
+from mpc.dynamics import Dynamics, Linearizable, advanced, expected_errors, linearized, of_steps, program_of
 from mpc.feedback import Feedback, FeedbackInfo, LinearQuadratic, finite_part, riccati
 from mpc.problem import Equations, Inputs, PlannerProblem, Programs, Rollouts, filled_up
 from mpc.search import COLOUR, Optimizer, Search, coloured_noise
@@ -266,10 +266,15 @@ class Planner:
         inputs, states = self._inputs(state, window), self.predicted(info, state, window)
         begin, compiled_before = time.perf_counter(), self._programs.seconds
         rest = np.repeat(states[-1:], self.horizon + 1 - len(states), axis=0)
-        function, arguments = program_of(self._equations.linear_quadratic, self.dynamics)
         all_states = np.concatenate([states, rest]).astype(np.float32)
+        controls = np.asarray(self.controls(plan, window.reference))
+        # Two programs, for the first compiles longest, and serves whatever the costs are.
+        linear, dynamics = program_of(linearized, self.dynamics)
+        costs, _ = program_of(self._equations.quadratic_costs, self.dynamics)
+        count = np.int32(window.steps or self.horizon)
         problem = LinearQuadratic(
-            *map(np.asarray, self._programs("feedback", function, *arguments, inputs, plan.knots, all_states))
+            *map(np.asarray, self._programs("linear", linear, *dynamics, all_states[:-1], controls, count)),
+            *map(np.asarray, self._programs("quadratic costs", costs, *dynamics, inputs, all_states[1:], controls)),
         )
         states = finite_part(states)
         if all(np.isfinite(array).all() for array in problem):
@@ -278,14 +283,7 @@ class Planner:
         else:
             gains, states = np.zeros((len(problem.by_control), 0, 0)), states[:1]
         feedback = Feedback(
-            steps,
-            np.asarray(self.controls(plan, window.reference)),
-            states,
-            gains,
-            problem.sum_by_state,
-            problem.sum_by_control,
-            self.lower,
-            self.upper,
+            steps, controls, states, gains, problem.sum_by_state, problem.sum_by_control, self.lower, self.upper
         )
         compile_seconds = self._programs.seconds - compiled_before
         seconds = time.perf_counter() - begin - compile_seconds

@@ -13,8 +13,8 @@ import numpy as np
 
 from larp_model.runtime import no_garbage_collection
 from mpc.cost import CostTerm, curvatures, evaluate, residuals, weighted_cost
-from mpc.dynamics import Continued, Dynamics, Linearizable, continued, of_steps, program_of, side_by_side
-from mpc.feedback import LinearQuadratic, linear_quadratic
+from mpc.dynamics import Continued, Coordinated, Dynamics, continued, of_steps, program_of, side_by_side
+from mpc.feedback import quadratic_costs
 from mpc.search import Evaluations, Residuals
 from mpc.spline import Interpolation, interpolate
 
@@ -108,26 +108,18 @@ class Equations:
 
         return jax.vmap(lambda direction: jax.jvp(residuals_of, (knots,), (direction,))[1])(directions)
 
-    def linear_quadratic(
-        self, dynamics: Linearizable | Continued, inputs: Inputs, knots: jax.Array, states: jax.Array
-    ) -> LinearQuadratic:
-        """Return the problem of feedback around knots (K, J, 3) and the states (H + 1, L, 13) that they pass."""
+    def quadratic_costs(
+        self, dynamics: Coordinated | Continued, inputs: Inputs, states: jax.Array, controls: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        """Return `feedback.quadratic_costs` around states (H, L, 13) after the steps, and controls (H, J, 3) [rad]."""
 
         def residuals_of(states: jax.Array, controls: jax.Array) -> dict[str, jax.Array]:
             return residuals(self.terms, continued(dynamics, states[None])[0], controls, inputs.context)
 
-        controls = self.controls(knots, inputs.reference)
-        curvature = curvatures(self.terms, residuals_of(states[1:], controls), inputs.weights)
+        curvature = curvatures(self.terms, residuals_of(states, controls), inputs.weights)
         steps = of_steps(dynamics)
-        assert isinstance(steps, Linearizable)
-        problem = linear_quadratic(steps, residuals_of, curvature, states, controls)
-        if inputs.steps is None:
-            return problem
-        computed = (jnp.arange(len(controls)) < inputs.steps)[:, None, None]
-        return problem._replace(
-            by_state=jnp.where(computed, problem.by_state, jnp.eye(problem.by_state.shape[1])),
-            by_control=jnp.where(computed, problem.by_control, 0.0),
-        )
+        assert isinstance(steps, Coordinated)
+        return quadratic_costs(steps, residuals_of, curvature, states, controls)
 
     def plan_cost(self, inputs: Inputs, knots: jax.Array, states: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Return the cost and each term's share of knots (K, J, 3) that led to states (H', L, 13)."""

@@ -16,7 +16,7 @@ from larp_model.scene import Scene
 from larp_model.simulator import Simulator
 from mpc import Continued, CostTerm, GaussNewton, Planner, Window
 from mpc.dynamics import linearizable
-from mpc.feedback import LARGEST_CHANGE, Feedback, LinearQuadratic, linear_quadratic, riccati
+from mpc.feedback import LARGEST_CHANGE, Feedback, LinearQuadratic, quadratic_costs, riccati
 from mpc.loop import Phase, execute
 
 COUNT, INPUTS, SUMS = 4, 2, 3
@@ -131,7 +131,10 @@ def test_the_quadratic_predicts_what_changes_of_start_and_controls_cost() -> Non
 
         states = jnp.concatenate([start[None], simulator.rollout(start[None], controls[None])[0]])
         ones = jax.tree.map(jnp.ones_like, residuals_of(states[1:], controls))
-        problem = linear_quadratic(simulator, residuals_of, ones, states, controls)
+        problem = LinearQuadratic(
+            *simulator.linearize(states[:-1], controls),
+            *quadratic_costs(simulator, residuals_of, ones, states[1:], controls),
+        )
         size = 1e-5
         deviation = size * random.standard_normal(problem.by_state.shape[1])
         changes = size * random.standard_normal((steps, 3))
