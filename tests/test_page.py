@@ -144,13 +144,9 @@ def kick_button(seen: Page) -> Locator:
 
 
 @pytest.fixture(autouse=True)
-def settings_are_left_as_found(request: pytest.FixtureRequest) -> Iterator[None]:
+def settings_are_left_as_found(served: Served) -> Iterator[None]:
     """Set the controls back where a test failed half-way, and say what the page said: others go on from there."""
-    if "served" not in request.fixturenames:
-        yield
-        return
-    page: LivePage = request.getfixturevalue("served").page
-    controls = page.panel._controls.values()
+    page, controls = served.page, served.page.panel._controls.values()
     before = [control.value for control in controls]
     yield
     print(page.settings, page.panel._text.content, sep="\n")
